@@ -1,0 +1,1 @@
+"""What reconstructs one segment alone. ``base`` has the protocol, each backbone a package of its own."""

@@ -1,0 +1,1 @@
+"""The backbone without weights: SIFT and mapping by pycolmap, depth by plane sweep."""

@@ -1,0 +1,123 @@
+"""Every setting of a run, with the reason for its default.
+
+These dataclasses are the command line (``--segment-length``), the TOML file (``segment_length``)
+and the record written beside the result, all three under the same names. Only the entry of a
+stage sees its settings; the functions below it take plain arguments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from smust3r_colmap.errors import ConfigError
+
+CameraMode = Literal["auto", "single", "per-folder", "per-image"]
+BackboneName = Literal["classical"]
+AlignmentSource = Literal["auto", "tracks", "pointmaps"]
+ConfidenceWeighting = Literal["relative", "paper", "off"]
+RobustKernel = Literal["cauchy", "tukey", "huber"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportConfig:
+    """Reading the image folder."""
+
+    camera_mode: CameraMode = "auto"
+    """Which images share intrinsics: auto is one camera per folder, size and camera model of the EXIF;
+    single is one for all; per-folder and per-image as named."""
+    camera_model: str = "SIMPLE_RADIAL"
+    """COLMAP model of cameras that come without calibration; COLMAP's own default, one distortion term."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentationConfig:
+    """Cutting the sequence (paper section III-B)."""
+
+    segment_length: int = 60
+    """Images per segment (l); the paper's setting."""
+    overlap: int = 30
+    """Images shared by neighbouring segments (p); the paper's setting."""
+
+    def __post_init__(self) -> None:
+        if self.segment_length < 2:
+            raise ConfigError(f"--segment-length {self.segment_length}: a segment needs at least 2 images")
+        if self.overlap < 1:
+            raise ConfigError(f"--overlap {self.overlap}: neighbouring segments must share at least 1 image")
+        if self.overlap >= self.segment_length:
+            raise ConfigError(
+                f"--overlap {self.overlap} must be smaller than --segment-length {self.segment_length}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClassicalConfig:
+    """The backbone that needs no weights: SIFT, mapping by pycolmap, plane sweep."""
+
+    max_image_size: int = 1600
+    """Longer side at which SIFT runs; larger costs time without many more stable features."""
+    max_features: int = 4096
+    """SIFT features per image; matching costs the square of it."""
+    match_neighbours: int = 8
+    """Every image is matched to this many next images in order."""
+    exhaustive_below: int = 25
+    """Segments of at most this many images are matched exhaustively (unordered collections)."""
+    dense_size: int = 384
+    """Longer side of the depth maps."""
+    depth_planes: int = 64
+    """Depth hypotheses per pixel, uniform in inverse depth."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlignmentConfig:
+    """Putting neighbouring segments together (paper sections III-C and III-E)."""
+
+    alignment_source: AlignmentSource = "auto"
+    """Correspondences: tracks shared by two segments where the backbone has them (as exact as dense
+    pixels at a twentieth of the cost), pointmaps otherwise."""
+    confidence_weighting: ConfidenceWeighting = "relative"
+    """Paper eq. 1 with the depth difference divided by the depth (relative), as printed (paper), or off."""
+    robust_kernel: RobustKernel = "cauchy"
+    """cauchy and tukey take their scale from the residuals; huber is the paper's, with a fixed delta."""
+    huber_delta: float = 0.1
+    """Where the paper's Huber loss turns linear, in segment units; only for the huber kernel."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FusionConfig:
+    """Making one cloud of all depth maps."""
+
+    max_points: int = 1_000_000
+    """Upper bound of the fused cloud of each model; what a laptop viewer and a splat trainer digest."""
+    min_confidence: float = 2.0
+    """Pixels below are left out; 1 is no confidence, each view that agrees adds one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputConfig:
+    """What is written."""
+
+    text: bool = False
+    """Write the COLMAP model as .txt beside the .bin files."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig:
+    """All of it."""
+
+    importing: ImportConfig = field(default_factory=ImportConfig)
+    segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
+    backbone: BackboneName = "classical"
+    """What reconstructs a segment; classical needs no weights."""
+    classical: ClassicalConfig = field(default_factory=ClassicalConfig)
+    alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)
+    output: OutputConfig = field(default_factory=OutputConfig)
+    workers: int = 0
+    """Processes; 0 takes one per core that this process may use."""
+    seed: int = 0
+    """Of every random choice; the same seed on the same machine gives the same result."""
+
+    def __post_init__(self) -> None:
+        if self.workers < 0:
+            raise ConfigError(f"--workers {self.workers}: give 0 (all cores) or a positive number")

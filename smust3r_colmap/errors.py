@@ -1,0 +1,63 @@
+"""Everything this package raises on purpose.
+
+    SmustrError
+    +-- InputError                the caller gave something unusable
+    |   +-- ConfigError           an option, or a combination of options
+    |   +-- ImageError            one image file
+    |   +-- CollectionError       the set of images as a whole
+    +-- ReconstructionError       the images are fine, the geometry did not come out
+    |   +-- DegenerateAlignmentError   points that do not determine a transform
+    +-- RunDirectoryError         the output folder
+    |   +-- RunLockedError        another process is writing to it
+    |   +-- StorageError          the disk refused (full, read-only, unreadable)
+    +-- MissingDependencyError    an optional package, with what to install
+
+A message names the file or segment at fault, the number found, the number needed and the way out.
+The next module to read is ``products``.
+"""
+
+from __future__ import annotations
+
+
+class SmustrError(Exception):
+    """Root of every error raised on purpose."""
+
+
+class InputError(SmustrError):
+    """The caller gave something unusable (exit code 2 on the command line)."""
+
+
+class ConfigError(InputError):
+    """An option, or a combination of options, makes no sense."""
+
+
+class ImageError(InputError):
+    """One image file cannot be used; the run goes on without it."""
+
+
+class CollectionError(InputError):
+    """The set of images as a whole cannot be used."""
+
+
+class ReconstructionError(SmustrError):
+    """The images were read, but no geometry came out."""
+
+
+class DegenerateAlignmentError(ReconstructionError):
+    """The given points do not determine the transform asked for."""
+
+
+class RunDirectoryError(SmustrError):
+    """The output folder cannot be used as it is."""
+
+
+class RunLockedError(RunDirectoryError):
+    """Another living process is writing to the same output folder."""
+
+
+class StorageError(RunDirectoryError):
+    """The disk refused a read or a write."""
+
+
+class MissingDependencyError(SmustrError):
+    """An optional package is not installed; the message names what to install."""

@@ -1,0 +1,1 @@
+"""Pure geometry on arrays: no files, no settings, no clocks. Start with ``sim3``."""

@@ -1,0 +1,342 @@
+"""The values that cross the border of a stage, in the order in which the pipeline makes them.
+
+Frames: ``world`` (one per model), ``seg`` (one per segment piece, its own gauge), ``cam``, ``img``.
+Images are numbered by their index in the collection; COLMAP ids are index + 1, everywhere.
+Every value is complete and checked when it is born. The next module to read is ``pipeline``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.geometry.sim3 import Sim3
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+
+# ----------------------------------------------------------------------------- import
+@dataclass(frozen=True, kw_only=True)
+class SourceImage:
+    """One usable image.
+
+    Args:
+        name: path relative to the image folder with forward slashes; the name in the COLMAP model.
+        path: where the file lies.
+        width, height: in pixels, after the EXIF orientation was applied.
+        camera: index into ``ImageCollection.cameras``.
+        digest: hash of the file's content, part of every key of a stage.
+        timestamp_s: capture time, where the source has one.
+    """
+
+    name: str
+    path: Path
+    width: int
+    height: int
+    camera: int
+    digest: str
+    timestamp_s: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class RejectedImage:
+    """A file that was left out, and why."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageCollection:
+    """All images in processing order, with the prior of each camera.
+
+    Raises:
+        ValueError: two images share a name, or a camera index or size does not fit.
+    """
+
+    images: tuple[SourceImage, ...]
+    cameras: tuple[Intrinsics, ...]
+    rejected: tuple[RejectedImage, ...] = ()
+
+    def __post_init__(self) -> None:
+        names = [image.name for image in self.images]
+        if len(set(names)) != len(names):
+            twice = sorted({name for name in names if names.count(name) > 1})
+            raise ValueError(f"duplicate image names: {twice[:5]}")
+        for image in self.images:
+            if not 0 <= image.camera < len(self.cameras):
+                raise ValueError(f"{image.name}: camera {image.camera} of {len(self.cameras)}")
+            camera = self.cameras[image.camera]
+            if (camera.width, camera.height) != (image.width, image.height):
+                raise ValueError(f"{image.name}: size does not fit camera {image.camera}")
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+
+# ----------------------------------------------------------------------- segmentation
+@dataclass(frozen=True, kw_only=True)
+class Segment:
+    """Images that are reconstructed together.
+
+    Args:
+        index: number of the segment in the plan.
+        images: indices into the collection, in order, without repeats.
+        kind: ``"window"`` of the sequence; other kinds come with other planners.
+    """
+
+    index: int
+    images: tuple[int, ...]
+    kind: str = "window"
+
+    def __post_init__(self) -> None:
+        if len(set(self.images)) != len(self.images) or not self.images:
+            raise ValueError(f"segment {self.index}: images must be distinct and at least one")
+
+
+# --------------------------------------------------------------------- reconstruction
+class DenseMaps(Protocol):
+    """Per-pixel geometry of the images of one piece, read from disk when asked for.
+
+    Position k runs over the images of the piece. A map of H x W pixels covers the whole image,
+    uniformly resized: ``x_orig = (j + 0.5) * width_orig / W``, and the same for y. H and W may
+    differ between images.
+    """
+
+    def __len__(self) -> int: ...
+
+    def pointmap_seg(self, k: int) -> npt.NDArray[np.float32]:
+        """(H, W, 3) in the segment frame, NaN where there is none."""
+
+    def depth(self, k: int) -> npt.NDArray[np.float32]:
+        """(H, W) z-depth in segment units, 0 where there is none."""
+
+    def confidence(self, k: int) -> npt.NDArray[np.float32]:
+        """(H, W), at least 1; 1 means no confidence at all."""
+
+    def rgb(self, k: int) -> npt.NDArray[np.uint8]:
+        """(H, W, 3) the image at the size of the maps."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tracks:
+    """Points of a piece seen as features of the run's database.
+
+    Two pieces share a point when they share an (image, feature) pair.
+
+    Args:
+        points_seg: (P, 3) float64 in the segment frame.
+        point_of_observation: (M,) row of ``points_seg``.
+        image_of_observation: (M,) index into the collection.
+        feature_of_observation: (M,) row of the image's keypoints in the database.
+    """
+
+    points_seg: FloatArray
+    point_of_observation: IntArray
+    image_of_observation: IntArray
+    feature_of_observation: IntArray
+
+    def __post_init__(self) -> None:
+        m = self.point_of_observation.shape
+        if self.points_seg.ndim != 2 or self.points_seg.shape[1] != 3:
+            raise ValueError(f"Tracks: points_seg is {self.points_seg.shape}, needed (P, 3)")
+        if self.image_of_observation.shape != m or self.feature_of_observation.shape != m:
+            raise ValueError("Tracks: observation arrays differ in length")
+        if m[0] and not 0 <= self.point_of_observation.min() <= self.point_of_observation.max() < len(self.points_seg):
+            raise ValueError("Tracks: an observation names a point that does not exist")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SegmentPiece:
+    """A connected part of a segment in a frame of its own; a node of the pose graph.
+
+    Args:
+        segment, piece: together the name of the node.
+        images: (N,) indices into the collection, ascending, all registered.
+        seg_from_cam: (N, 3, 4) rigid.
+        intrinsics: one per image, at the original image size.
+        method: which rung of the ladder made it, in words.
+        reprojection_error_px: mean over the observations; NaN where the backbone has no features.
+        tracks: feature tracks, where the backbone has them.
+        descriptors: (N, D) float32, unit length; one per image, for finding loops.
+    """
+
+    segment: int
+    piece: int
+    images: tuple[int, ...]
+    seg_from_cam: FloatArray
+    intrinsics: tuple[Intrinsics, ...]
+    method: str
+    reprojection_error_px: float
+    tracks: Tracks | None
+    descriptors: npt.NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        n = len(self.images)
+        if self.descriptors.ndim != 2 or len(self.descriptors) != n:
+            raise ValueError(f"piece {self.name}: {n} images, descriptors {self.descriptors.shape}")
+        if self.seg_from_cam.shape != (n, 3, 4) or len(self.intrinsics) != n:
+            raise ValueError(
+                f"piece {self.name}: {n} images, poses {self.seg_from_cam.shape}, {len(self.intrinsics)} intrinsics"
+            )
+        if list(self.images) != sorted(set(self.images)):
+            raise ValueError(f"piece {self.name}: images must ascend without repeats")
+        if not np.isfinite(self.seg_from_cam).all():
+            raise ValueError(f"piece {self.name}: a pose is not finite")
+
+    @property
+    def name(self) -> str:
+        """For people, such as ``3`` or ``3b`` for the second piece of segment 3."""
+        return f"{self.segment}{'' if self.piece == 0 else chr(ord('a') + self.piece)}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnregisteredImage:
+    """An image of a segment that got no pose there, and why."""
+
+    image: int
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentReconstruction:
+    """What a backbone made of one segment: any number of pieces, largest first.
+
+    Args:
+        segment: index of the segment.
+        pieces: accepted pieces; empty when nothing came out.
+        unregistered: images of the segment in no piece.
+        attempts: what was tried, in order, in words for people.
+        metric: lengths are metres.
+    """
+
+    segment: int
+    pieces: tuple[SegmentPiece, ...]
+    unregistered: tuple[UnregisteredImage, ...]
+    attempts: tuple[str, ...]
+    metric: bool
+
+
+# -------------------------------------------------------------------------- alignment
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sim3Estimate:
+    """A fitted ``b_from_a`` with its evidence.
+
+    Args:
+        b_from_a: the transform.
+        num_points: correspondences of positive weight that were offered.
+        num_inliers: those within three robust standard deviations.
+        rms: of the inlier residuals, in units of b (or relative, where the caller normalised).
+        residual_sigma: robust standard deviation of all residuals (1.4826 MAD).
+        iterations: of the reweighting.
+        stop_reason: ``"converged"`` or ``"iteration limit"``.
+        information: (7, 7) inverse covariance of the right perturbation
+            ``b_from_a @ exp(delta)``, delta = (translation, rotation vector, log scale).
+    """
+
+    b_from_a: Sim3
+    num_points: int
+    num_inliers: int
+    rms: float
+    residual_sigma: float
+    iterations: int
+    stop_reason: str
+    information: FloatArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SegmentAlignment:
+    """An edge of the pose graph between two pieces.
+
+    Args:
+        target, source: positions in the list of all pieces of the run.
+        estimate: ``target_from_source`` with its evidence.
+        evidence: ``"tracks"`` or ``"pointmaps"``.
+        relative_residual: median residual divided by depth, the test of a sound edge.
+        accepted: False when the edge failed a test; it is kept for the record.
+        reason: why it was refused, or empty.
+    """
+
+    target: int
+    source: int
+    estimate: Sim3Estimate
+    evidence: str
+    relative_residual: float
+    accepted: bool
+    reason: str = ""
+
+
+# ------------------------------------------------------------------------------ scene
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PointCloud:
+    """Coloured points without tracks.
+
+    Args:
+        xyz: (P, 3) float64. rgb: (P, 3) uint8. normals: (P, 3) float32 unit vectors, or None.
+    """
+
+    xyz: FloatArray
+    rgb: npt.NDArray[np.uint8]
+    normals: npt.NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        p = len(self.xyz)
+        if self.xyz.shape != (p, 3) or self.rgb.shape != (p, 3) or self.rgb.dtype != np.uint8:
+            raise ValueError(f"PointCloud: xyz {self.xyz.shape}, rgb {self.rgb.shape} {self.rgb.dtype}")
+        if self.normals is not None and self.normals.shape != (p, 3):
+            raise ValueError(f"PointCloud: normals {self.normals.shape} for {p} points")
+        if not np.isfinite(self.xyz).all():
+            raise ValueError("PointCloud: a coordinate is not finite")
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scene:
+    """One connected model: every image once, in one world frame.
+
+    Args:
+        image_indices: (N,) indices into the collection, ascending; COLMAP image id = index + 1.
+        image_names: (N,) names in the model.
+        camera_indices: (N,) camera of each image; COLMAP camera id = index + 1.
+        cameras: intrinsics by camera index, at the original image size.
+        cam_from_world: (N, 3, 4) rigid.
+        points: the fused cloud, in the world frame.
+        metric: lengths are metres.
+        segments: names of the pieces that were stitched, the first being the world frame.
+    """
+
+    image_indices: tuple[int, ...]
+    image_names: tuple[str, ...]
+    camera_indices: tuple[int, ...]
+    cameras: dict[int, Intrinsics]
+    cam_from_world: FloatArray
+    points: PointCloud
+    metric: bool
+    segments: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        n = len(self.image_indices)
+        if len(self.image_names) != n or len(self.camera_indices) != n or self.cam_from_world.shape != (n, 3, 4):
+            raise ValueError(f"Scene: {n} images, {len(self.image_names)} names, poses {self.cam_from_world.shape}")
+        if list(self.image_indices) != sorted(set(self.image_indices)):
+            raise ValueError("Scene: images must ascend without repeats")
+        missing = set(self.camera_indices) - set(self.cameras)
+        if missing:
+            raise ValueError(f"Scene: no intrinsics for cameras {sorted(missing)}")
+
+    def __len__(self) -> int:
+        return len(self.image_indices)
+
+
+def largest_first(scenes: Sequence[Scene]) -> tuple[Scene, ...]:
+    """Scenes by falling number of images; ties keep their order."""
+    return tuple(sorted(scenes, key=len, reverse=True))

@@ -1,0 +1,1 @@
+"""Cutting a collection into segments. ``windows`` follows the order of the images."""
