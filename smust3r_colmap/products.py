@@ -154,6 +154,21 @@ class Tracks:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class FeatureLinks:
+    """Verified matches between features of two images, which tie pieces that share no image.
+
+    Args:
+        image_a, feature_a, image_b, feature_b: (M,) each; images are indices into the collection,
+            features rows of the image's keypoints.
+    """
+
+    image_a: IntArray
+    feature_a: IntArray
+    image_b: IntArray
+    feature_b: IntArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class SegmentPiece:
     """A connected part of a segment in a frame of its own; a node of the pose graph.
 
@@ -258,7 +273,7 @@ class SegmentAlignment:
     Args:
         target, source: positions in the list of all pieces of the run.
         estimate: ``target_from_source`` with its evidence.
-        evidence: ``"tracks"`` or ``"pointmaps"``.
+        evidence: ``"tracks"``, ``"pointmaps"``, or ``"links"`` (matches between images).
         relative_residual: median residual divided by depth, the test of a sound edge.
         accepted: False when the edge failed a test; it is kept for the record.
         reason: why it was refused, or empty.

@@ -1,0 +1,189 @@
+"""Aligning two pieces by feature tracks: points that both saw as the same feature of the same image.
+
+`align_tracks` needs shared images. `match_links` is the bridge between pieces that share none, or
+too few: a verified two-view match says that a feature here and a feature there are one point.
+The solver is in ``irls``; ``from_pointmaps`` does the same for dense maps.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from smust3r_colmap.alignment.irls import PieceFit, align_seen_points
+from smust3r_colmap.config import AlignmentConfig
+from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.products import SegmentPiece, Tracks
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+MAX_VOTES = 5
+"""Shared observations of a point pair that count: more of them make the pairing no surer."""
+MAX_LINK_ERROR = 0.25
+"""Residual over depth at the robust start beyond which a link counts as a wrong match: five times the
+agreement the start asks for. Links start far off and may be wrong in their majority."""
+_KEY_SHIFT = np.int64(2**32)
+
+
+def align_tracks(target: SegmentPiece, source: SegmentPiece, settings: AlignmentConfig, *, seed: int = 0) -> PieceFit:
+    """Robust ``target_from_source`` from points that share an (image, feature) observation.
+
+    Every pair of points counts once and weighs as many shared observations as it has, up to 5. With
+    the redescending kernels residuals are divided by the depth (see ``irls.align_seen_points``).
+
+    Args:
+        target, source: pieces with tracks.
+        settings: kernel.
+        seed: of the search for a robust start.
+
+    Raises:
+        DegenerateAlignmentError: too few points are shared, or they do not determine the transform.
+        ValueError: a piece has no tracks, or its tracks name an image that is not of the piece.
+    """
+    on_target, on_source = _tracks(target), _tracks(source)
+    _, row_target, row_source = np.intersect1d(_keys(on_target), _keys(on_source), return_indices=True)
+    return _align_point_pairs(
+        target,
+        source,
+        on_target.point_of_observation[row_target],
+        on_source.point_of_observation[row_source],
+        settings,
+        evidence="shared track points",
+        max_start_error=np.inf,
+        seed=seed,
+    )
+
+
+def match_links(
+    target: SegmentPiece,
+    source: SegmentPiece,
+    settings: AlignmentConfig,
+    *,
+    image_a: npt.ArrayLike,
+    feature_a: npt.ArrayLike,
+    image_b: npt.ArrayLike,
+    feature_b: npt.ArrayLike,
+    seed: int = 0,
+) -> PieceFit:
+    """Robust ``target_from_source`` from two-view matches between images of the two pieces.
+
+    A match links the target's point behind (image_a, feature_a) to the source's point behind
+    (image_b, feature_b); matches with a feature that is part of no point are passed over. With the
+    redescending kernels links further than a quarter of their depth from the robust start are left
+    out; they still count in ``num_correspondences`` and ``relative_residual``.
+
+    Args:
+        target, source: pieces with tracks; they need not share an image.
+        settings: kernel.
+        image_a, feature_a: (M,) in images of the target. image_b, feature_b: (M,) in images of the source.
+        seed: of the search for a robust start.
+
+    Raises:
+        DegenerateAlignmentError: too few points are linked, or they do not determine the transform.
+        ValueError: the arrays differ in length, or a piece has no or foreign tracks.
+    """
+    arrays = [np.asarray(values, dtype=np.int64) for values in (image_a, feature_a, image_b, feature_b)]
+    if len({values.shape for values in arrays}) != 1 or arrays[0].ndim != 1:
+        raise ValueError(f"matches: arrays of shapes {[values.shape for values in arrays]}, needed (M,) each")
+    point_target = _points_behind(_tracks(target), arrays[0], arrays[1])
+    point_source = _points_behind(_tracks(source), arrays[2], arrays[3])
+    linked = (point_target >= 0) & (point_source >= 0)
+    return _align_point_pairs(
+        target,
+        source,
+        point_target[linked],
+        point_source[linked],
+        settings,
+        evidence="points linked by matches",
+        max_start_error=MAX_LINK_ERROR,
+        seed=seed,
+    )
+
+
+def _align_point_pairs(
+    target: SegmentPiece,
+    source: SegmentPiece,
+    point_target: IntArray,
+    point_source: IntArray,
+    settings: AlignmentConfig,
+    *,
+    evidence: str,
+    max_start_error: float,
+    seed: int,
+) -> PieceFit:
+    """The fit to pairs of points named once for each vote they have."""
+    pairs, votes = np.unique(np.column_stack([point_target, point_source]), axis=0, return_counts=True)
+    depth_target, depth_source = point_depths(target)[pairs[:, 0]], point_depths(source)[pairs[:, 1]]
+    points_target, points_source = _tracks(target).points_seg[pairs[:, 0]], _tracks(source).points_seg[pairs[:, 1]]
+    usable = np.isfinite(np.column_stack([depth_target, depth_source, points_target, points_source])).all(axis=1)
+    try:
+        return align_seen_points(
+            points_source[usable],
+            points_target[usable],
+            np.minimum(votes, MAX_VOTES)[usable].astype(np.float64),
+            depth_source=depth_source[usable],
+            depth_target=depth_target[usable],
+            kernel=settings.robust_kernel,
+            huber_delta=settings.huber_delta,
+            max_start_error=max_start_error,
+            seed=seed,
+        )
+    except DegenerateAlignmentError as error:
+        raise DegenerateAlignmentError(f"pieces {target.name} and {source.name}, {evidence}: {error}") from error
+
+
+def point_depths(piece: SegmentPiece) -> FloatArray:
+    """(P,) geometric mean over its observations of each track point's z-depth, in segment units.
+
+    Observations with the point behind the camera are passed over; NaN where none is left.
+
+    Raises:
+        ValueError: the piece has no tracks, or they name an image that is not of the piece.
+    """
+    tracks = _tracks(piece)
+    images = np.asarray(piece.images)
+    position = np.searchsorted(images, tracks.image_of_observation).clip(max=len(images) - 1)
+    if (images[position] != tracks.image_of_observation).any():
+        foreign = sorted(set(tracks.image_of_observation.tolist()) - set(piece.images))
+        raise ValueError(f"piece {piece.name}: tracks name images {foreign[:5]}, which are not of the piece")
+    pose = piece.seg_from_cam[position]
+    offset = tracks.points_seg[tracks.point_of_observation] - pose[:, :, 3]
+    depth = np.einsum("ni,ni->n", pose[:, :, 2], offset)
+    front = depth > 0
+    point = tracks.point_of_observation[front]
+    num_points = len(tracks.points_seg)
+    total = np.bincount(point, weights=np.log(depth[front]), minlength=num_points)
+    count = np.bincount(point, minlength=num_points)
+    mean_log = np.divide(total, count, out=np.full(num_points, np.nan), where=count > 0)
+    depths: FloatArray = np.exp(mean_log)
+    return depths
+
+
+def _tracks(piece: SegmentPiece) -> Tracks:
+    """The tracks of a piece that must have them."""
+    if piece.tracks is None:
+        raise ValueError(f"piece {piece.name} has no tracks; align its pointmaps instead")
+    return piece.tracks
+
+
+def _keys(tracks: Tracks) -> IntArray:
+    """(M,) one number per (image, feature)."""
+    return _key(tracks.image_of_observation, tracks.feature_of_observation)
+
+
+def _key(image: IntArray, feature: IntArray) -> IntArray:
+    """One number for image and feature; a feature is a row of a keypoint array, far below 2^32."""
+    keys: IntArray = image * _KEY_SHIFT + feature
+    return keys
+
+
+def _points_behind(tracks: Tracks, image: IntArray, feature: IntArray) -> IntArray:
+    """(N,) point of each (image, feature), -1 where it is part of none."""
+    if len(tracks.point_of_observation) == 0:
+        return np.full(len(image), -1, dtype=np.int64)
+    keys, first = np.unique(_keys(tracks), return_index=True)
+    wanted = _key(image, feature)
+    row = np.searchsorted(keys, wanted).clip(max=len(keys) - 1)
+    points: IntArray = np.where(keys[row] == wanted, tracks.point_of_observation[first[row]], -1)
+    return points

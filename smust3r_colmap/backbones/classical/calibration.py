@@ -1,0 +1,167 @@
+"""One calibration for the whole run.
+
+Self-calibration inside a short segment is weak: focal lengths of neighbouring segments differ by
+some percent, and now and then one diverges (853 px for 525). Segments whose cameras differ do not
+fit together by any similarity. So the run agrees on one set of intrinsics per camera, and every
+model is adjusted to it. A model that had diverged is mapped again from the agreed values.
+The next module to read is ``dense``.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from smust3r_colmap.backbones.classical.features import internal_name
+from smust3r_colmap.backbones.classical.mapping import (
+    FOCAL_TOLERANCE,
+    MappedModel,
+    MappedSegment,
+    MappingTask,
+    map_segment,
+    model_from_reconstruction,
+)
+from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.geometry.sim3 import invert_rigid
+
+logger = logging.getLogger(__name__)
+
+MAX_ERROR_GROWTH = 1.25
+"""A model that fits the agreed cameras worse than this keeps its own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationTask:
+    """One mapped segment to bring to the agreed cameras.
+
+    Args:
+        mapping: the task that made it. mapped: its result.
+        agreed: intrinsics by camera index, for the cameras that have been agreed on.
+    """
+
+    mapping: MappingTask
+    mapped: MappedSegment
+    agreed: Mapping[int, Intrinsics]
+
+
+def agree_on_cameras(
+    segments: Sequence[MappedSegment], camera_of_image: Sequence[int], priors: Sequence[Intrinsics]
+) -> dict[int, Intrinsics]:
+    """Weighted median of each parameter over the models, by camera index.
+
+    A model counts as many times as it has images of the camera and observations per image allow:
+    weight is images of the camera times the square root of its points. Cameras that only one model
+    has seen are agreed by definition and left out.
+    """
+    params: dict[int, list[tuple[float, tuple[float, ...]]]] = {}
+    for segment in segments:
+        for model in segment.models:
+            cameras = [camera_of_image[image] for image in model.images]
+            for camera in sorted(set(cameras)):
+                intrinsics = model.intrinsics[cameras.index(camera)]
+                weight = cameras.count(camera) * float(np.sqrt(len(model.tracks.points_seg)))
+                params.setdefault(camera, []).append((weight, intrinsics.params))
+    agreed = {}
+    for camera, seen in params.items():
+        if len(seen) < 2:
+            continue
+        weights = np.array([weight for weight, _ in seen])
+        values = np.array([value for _, value in seen])
+        median = tuple(weighted_median(values[:, column], weights) for column in range(values.shape[1]))
+        agreed[camera] = replace(priors[camera], params=median)
+    return agreed
+
+
+def weighted_median(values: npt.NDArray[np.float64], weights: npt.NDArray[np.float64]) -> float:
+    """The value at which half of the weight is reached, interpolated between neighbours."""
+    order = np.argsort(values, kind="stable")
+    cumulative = np.cumsum(weights[order]) - 0.5 * weights[order]
+    return float(np.interp(0.5 * weights.sum(), cumulative, values[order]))
+
+
+def calibrate_segment(task: CalibrationTask) -> MappedSegment:
+    """Map again what diverged, then adjust every model with the agreed cameras held fixed."""
+    mapped = task.mapped
+    trusted = {camera: intrinsics.focal_px for camera, intrinsics in task.agreed.items()}
+    if any(_diverged(model, task.mapping, trusted) for model in mapped.models):
+        start = tuple(task.agreed.get(index, camera) for index, camera in enumerate(task.mapping.cameras))
+        again = map_segment(replace(task.mapping, cameras=start, trusted_focal=trusted))
+        mapped = replace(
+            again, attempts=(*mapped.attempts, "focal length off the run's: mapped again", *again.attempts)
+        )
+    models = []
+    notes = []
+    for model in mapped.models:
+        adjusted, note = _adjust(model, task)
+        models.append(adjusted)
+        notes.append(note)
+    return replace(mapped, models=tuple(models), attempts=(*mapped.attempts, *notes))
+
+
+def _diverged(model: MappedModel, mapping: MappingTask, trusted: Mapping[int, float]) -> bool:
+    camera_of = dict(zip(mapping.images, mapping.camera_indices, strict=True))
+    for image, intrinsics in zip(model.images, model.intrinsics, strict=True):
+        focal = trusted.get(camera_of[image])
+        if focal and abs(np.log(intrinsics.focal_px / focal)) > np.log1p(FOCAL_TOLERANCE):
+            return True
+    return False
+
+
+def _adjust(model: MappedModel, task: CalibrationTask) -> tuple[MappedModel, str]:
+    """Bundle adjustment under the agreed cameras, kept unless it fits clearly worse."""
+    reconstruction = reconstruction_from_model(model, task)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length = False
+    options.refine_extra_params = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.num_threads = 1
+    options.ceres.solver_options.function_tolerance = 1e-6
+    options.ceres.solver_options.max_num_iterations = 50
+    pycolmap.bundle_adjustment(reconstruction, options)
+    observations = pycolmap.ObservationManager(reconstruction)
+    observations.filter_all_points3D(4.0, 1.5)
+    reconstruction.update_point_3d_errors()
+    adjusted = model_from_reconstruction(reconstruction, model.method)
+    before, after = model.reprojection_error_px, adjusted.reprojection_error_px
+    worse = len(adjusted.images) < len(model.images) or not after < MAX_ERROR_GROWTH * before + 0.05
+    kept_points = len(adjusted.tracks.points_seg) / max(len(model.tracks.points_seg), 1)
+    if worse or kept_points < 0.7:
+        return (
+            model,
+            f"{len(model.images)} images keep their own focal length ({before:.2f} px, agreed one {after:.2f} px)",
+        )
+    return adjusted, f"{len(model.images)} images adjusted to the agreed camera ({before:.2f} -> {after:.2f} px)"
+
+
+def reconstruction_from_model(model: MappedModel, task: CalibrationTask) -> pycolmap.Reconstruction:
+    """A pycolmap model with the agreed cameras in place of its own, where there are any."""
+    mapping = task.mapping
+    camera_of = dict(zip(mapping.images, mapping.camera_indices, strict=True))
+    reconstruction = pycolmap.Reconstruction()
+    for camera in sorted({camera_of[image] for image in model.images}):
+        own = next(i for image, i in zip(model.images, model.intrinsics, strict=True) if camera_of[image] == camera)
+        reconstruction.add_camera_with_trivial_rig(task.agreed.get(camera, own).colmap_camera(camera + 1))
+    with pycolmap.Database.open(mapping.database) as database:
+        for k, index in enumerate(model.images):
+            image = pycolmap.Image(name=internal_name(index), camera_id=camera_of[index] + 1, image_id=index + 1)
+            xy_img = np.asarray(database.read_keypoints(index + 1), dtype=np.float64)[:, :2]
+            image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in xy_img])
+            cam_from_seg = pycolmap.Rigid3d(invert_rigid(model.seg_from_cam[k]))
+            reconstruction.add_image_with_trivial_frame(image, cam_from_seg)
+    tracks = model.tracks
+    order = np.argsort(tracks.point_of_observation, kind="stable")
+    bounds = np.searchsorted(tracks.point_of_observation[order], np.arange(len(tracks.points_seg) + 1))
+    for row, xyz in enumerate(tracks.points_seg):
+        elements = [
+            pycolmap.TrackElement(int(tracks.image_of_observation[m]) + 1, int(tracks.feature_of_observation[m]))
+            for m in order[bounds[row] : bounds[row + 1]]
+        ]
+        reconstruction.add_point3D(xyz, pycolmap.Track(elements), np.zeros(3, np.uint8))
+    return reconstruction

@@ -1,0 +1,215 @@
+"""SIFT features and verified matches, once per image and once per pair in the whole run.
+
+Everything lies in one COLMAP database whose ids we assign before anything is extracted
+(image id = index + 1), because COLMAP itself numbers images in the order in which its threads
+finish. What is in the database is done: a second start extracts and matches only what is missing.
+The next module to read is ``mapping``.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from smust3r_colmap.execution import TaskFailure, map_tasks
+from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.importers.images import load_grey
+from smust3r_colmap.products import ImageCollection, RejectedImage, Segment, SourceImage
+from smust3r_colmap.progress import Stage
+
+logger = logging.getLogger(__name__)
+
+Pair = tuple[int, int]
+
+_PAIRS_PER_THREAD = 100
+_SPARSE_PEAK_THRESHOLD = 0.002
+"""Second try for images that gave fewer than a quarter of the features allowed (COLMAP's own is 0.0067)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ExtractionTask:
+    image: SourceImage
+    max_image_size: int
+    max_features: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Features:
+    keypoints: npt.NDArray[np.float32]  # (K, 4) x, y, scale, orientation
+    descriptors: npt.NDArray[np.uint8]  # (K, 128)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _MatchingTask:
+    database: Path
+    pairs: tuple[Pair, ...]
+    threads: int
+    seed: int
+
+
+def create_database(path: Path, collection: ImageCollection) -> None:
+    """Write cameras, rigs, frames and images with our ids, unless the database has them already."""
+    with pycolmap.Database.open(path) as database:
+        if database.num_images() == len(collection):
+            return
+        database.clear_all_tables()
+        with pycolmap.DatabaseTransaction(database):
+            write_images(database, collection.cameras, [(i, image.camera) for i, image in enumerate(collection.images)])
+
+
+def write_images(database: pycolmap.Database, cameras: Sequence[Intrinsics], images: Iterable[tuple[int, int]]) -> None:
+    """Write all ``cameras`` and the images given as (index, camera index), one rig and frame each.
+
+    Inside the run an image goes by its number: pycolmap's lists of pairs are text and would cut
+    names at the first blank.
+    """
+    for index, intrinsics in enumerate(cameras):
+        camera = intrinsics.colmap_camera(index + 1)
+        database.write_camera(camera, use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=index + 1)
+        rig.add_ref_sensor(camera.sensor_id)
+        database.write_rig(rig, use_rig_id=True)
+    for index, camera_index in images:
+        image = pycolmap.Image(name=internal_name(index), camera_id=camera_index + 1, image_id=index + 1)
+        database.write_image(image, use_image_id=True)
+        frame = pycolmap.Frame(frame_id=index + 1, rig_id=camera_index + 1)
+        frame.add_data_id(image.data_id)
+        database.write_frame(frame, use_frame_id=True)
+
+
+def internal_name(index: int) -> str:
+    """The name of an image in the databases of a run."""
+    return f"{index:08d}"
+
+
+def extract_features(
+    path: Path,
+    collection: ImageCollection,
+    *,
+    max_image_size: int,
+    max_features: int,
+    workers: int,
+    log_file: Path | None,
+    stage: Stage,
+) -> tuple[RejectedImage, ...]:
+    """Extract SIFT for every image that has no keypoints yet; returns the images that failed.
+
+    Keypoints are in pixels of the original image (first pixel centre at 0.5), whatever
+    ``max_image_size`` they were found at. An image that fails gets zero keypoints.
+    """
+    failed = []
+    with pycolmap.Database.open(path) as database:
+        missing = [i for i in range(len(collection)) if not database.exists_keypoints(i + 1)]
+        stage.skip(len(collection) - len(missing))
+        tasks = [
+            _ExtractionTask(image=collection.images[i], max_image_size=max_image_size, max_features=max_features)
+            for i in missing
+        ]
+        for result in map_tasks(_extract, tasks, workers=workers, log_file=log_file):
+            index = missing[result.index]
+            features = result.value
+            if isinstance(features, TaskFailure):
+                failed.append(RejectedImage(name=collection.images[index].name, reason=f"SIFT: {features.reason}"))
+                features = _Features(keypoints=np.zeros((0, 4), np.float32), descriptors=np.zeros((0, 128), np.uint8))
+            with pycolmap.DatabaseTransaction(database):
+                database.write_descriptors(
+                    index + 1, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, features.descriptors)
+                )
+                database.write_keypoints(index + 1, features.keypoints)
+            stage.advance()
+    return tuple(failed)
+
+
+def _extract(task: _ExtractionTask) -> _Features:
+    grey = load_grey(task.image)
+    scale = min(1.0, task.max_image_size / max(grey.shape))
+    if scale < 1.0:
+        size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
+        small = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    else:
+        small = grey
+    features = _sift(small, task.max_features, peak_threshold=None)
+    if len(features.keypoints) < task.max_features // 4:
+        features = _sift(small, task.max_features, peak_threshold=_SPARSE_PEAK_THRESHOLD)
+    features.keypoints[:, 0] *= grey.shape[1] / small.shape[1]
+    features.keypoints[:, 1] *= grey.shape[0] / small.shape[0]
+    features.keypoints[:, 2] *= grey.shape[1] / small.shape[1]
+    return features
+
+
+def _sift(grey: npt.NDArray[np.uint8], max_features: int, *, peak_threshold: float | None) -> _Features:
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = 1
+    options.use_gpu = False
+    options.sift.max_num_features = max_features
+    if peak_threshold is not None:
+        options.sift.peak_threshold = peak_threshold
+    extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+    keypoints, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(grey))
+    matrix = np.asarray(pycolmap.keypoints_to_matrix(keypoints), dtype=np.float32).reshape(-1, 4).copy()
+    return _Features(keypoints=matrix, descriptors=np.asarray(descriptors.data).reshape(-1, 128).copy())
+
+
+def plan_pairs(segment: Segment, *, neighbours: int, exhaustive_below: int) -> tuple[Pair, ...]:
+    """Pairs (i < j) of a segment worth matching: all in a small one, else neighbours and doubling steps.
+
+    Only inside the segment: a longer reach finds look-alike places and folds the model.
+    """
+    images = sorted(segment.images)
+    n = len(images)
+    if n <= exhaustive_below:
+        offsets: Iterable[int] = range(1, n)
+    else:
+        doubling = [2**k for k in range(1, n.bit_length()) if neighbours < 2**k < n]
+        offsets = [*range(1, neighbours + 1), *doubling]
+    return tuple((images[a], images[a + offset]) for offset in offsets for a in range(n - offset))
+
+
+def match_pairs(
+    path: Path,
+    pairs: Iterable[Pair],
+    *,
+    workers: int,
+    seed: int,
+    log_file: Path | None,
+    stage: Stage,
+) -> None:
+    """Match and verify every pair that is not in the database yet; each pair once in the run.
+
+    pycolmap writes a pair when it is finished, also one without a match, so what is there is done.
+    """
+    wanted = sorted(set(pairs))
+    with pycolmap.Database.open(path) as database:
+        missing = [pair for pair in wanted if not database.exists_matches(pair[0] + 1, pair[1] + 1)]
+    stage.skip(len(wanted) - len(missing))
+    size = _PAIRS_PER_THREAD * workers
+    tasks = [
+        _MatchingTask(database=path, pairs=tuple(missing[k : k + size]), threads=workers, seed=seed)
+        for k in range(0, len(missing), size)
+    ]
+    # One child with threads, not many children: SQLite takes one writer at a time.
+    for result in map_tasks(_match, tasks, workers=1, log_file=log_file):
+        if isinstance(result.value, TaskFailure):
+            logger.warning("%d pairs were not matched: %s", len(tasks[result.index].pairs), result.value.reason)
+        stage.advance(len(tasks[result.index].pairs))
+
+
+def _match(task: _MatchingTask) -> None:
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads = task.threads
+    matching.use_gpu = False
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = task.seed
+    with tempfile.TemporaryDirectory(prefix="smust3r-match-") as scratch:
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = Path(scratch) / "pairs.txt"
+        pairing.match_list_path.write_text("".join(f"{internal_name(a)} {internal_name(b)}\n" for a, b in task.pairs))
+        pycolmap.match_image_pairs(task.database, matching, pairing, verification, pycolmap.Device.cpu)

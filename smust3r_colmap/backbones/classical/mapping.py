@@ -1,0 +1,387 @@
+"""Camera poses and sparse points of one segment, by pycolmap's mappers.
+
+No mapper is safe alone: the incremental one finds no start on straight forward motion and stops at
+weak spots, the global one registers more but may be wrong with a perfect-looking error. So a ladder
+is climbed until a model passes the tests: incremental, relaxed incremental, global. What still does
+not hold together becomes several pieces. Everything here runs in a child process.
+The next module to read is ``calibration``.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from smust3r_colmap.backbones.classical.features import Pair, write_images
+from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.products import Tracks, UnregisteredImage
+
+logger = logging.getLogger(__name__)
+
+ENOUGH_REGISTERED = 0.9
+"""Share of a segment's images in one model at which the ladder stops."""
+MIN_PIECE_IMAGES = 4
+"""Smaller models are too weak to be a node; a segment that is itself smaller may still be one."""
+MAX_TURN_DEG = 60.0
+"""Neighbouring images that match cannot have turned by more (honest walks: 52 at most; folds: 150)."""
+MAX_STEP_RATIO = 10.0
+"""Nor moved by more than this many median steps (honest walks: 1.8; folds: 33 to 42) ..."""
+MIN_JUMP_DEPTHS = 0.5
+"""... unless the step is small beside the distance of what they see, as after a pause."""
+MIN_PAIR_INLIERS = 15
+"""Verified matches below which COLMAP does not use a pair."""
+STRONG_PAIR_INLIERS = 30
+"""Verified matches that make two images certain neighbours (COLMAP's own bar for registration)."""
+NEAR_OFFSET = 4
+"""Reach of the pairs that are left when the longer ones folded the model."""
+FOCAL_TOLERANCE = 0.15
+"""A focal length farther from the run's median belongs to a diverged self-calibration."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MappingTask:
+    """One segment to map.
+
+    Args:
+        segment: its index. database: the run's. images: indices in order, with their cameras.
+        pairs: which of the database's pairs may be used.
+        cameras: start values by camera index.
+        trusted_focal: the run's consensus focal length by camera index, empty in the first pass.
+        seed: of pycolmap's samplers.
+    """
+
+    segment: int
+    database: Path
+    images: tuple[int, ...]
+    camera_indices: tuple[int, ...]
+    pairs: tuple[Pair, ...]
+    cameras: tuple[Intrinsics, ...]
+    trusted_focal: Mapping[int, float]
+    seed: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MappedModel:
+    """One connected model of a segment, as arrays (see ``SegmentPiece`` for shapes)."""
+
+    images: tuple[int, ...]
+    seg_from_cam: npt.NDArray[np.float64]
+    intrinsics: tuple[Intrinsics, ...]
+    tracks: Tracks
+    reprojection_error_px: float
+    method: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class MappedSegment:
+    """All models of a segment, largest first, with what was tried and what was left out."""
+
+    segment: int
+    models: tuple[MappedModel, ...]
+    attempts: tuple[str, ...]
+    unregistered: tuple[UnregisteredImage, ...]
+
+
+def map_segment(task: MappingTask) -> MappedSegment:
+    """Climb the ladder for one segment; never raises for geometry that does not come out."""
+    with tempfile.TemporaryDirectory(prefix="smust3r-map-") as scratch:
+        ladder = _Ladder(task, Path(scratch))
+        ladder.climb()
+        models = ladder.best_models()
+    placed = {image for model in models for image in model.images}
+    left = tuple(
+        UnregisteredImage(image=image, reason=ladder.why_not(image, placed))
+        for image in task.images
+        if image not in placed
+    )
+    return MappedSegment(segment=task.segment, models=models, attempts=tuple(ladder.attempts), unregistered=left)
+
+
+class _Ladder:
+    """The attempts at one segment and the best models so far."""
+
+    def __init__(self, task: MappingTask, scratch: Path) -> None:
+        self.task = task
+        self.scratch = scratch
+        self.attempts: list[str] = []
+        self.candidates: list[tuple[MappedModel, ...]] = []
+        self.largest_output: Path | None = None
+        self.min_images = min(MIN_PIECE_IMAGES, len(task.images))
+        self.inliers = self._build_database("segment.db", task.pairs)
+
+    def climb(self) -> None:
+        """Try the rungs in order until one places enough images."""
+        if not any(count >= MIN_PAIR_INLIERS for count in self.inliers.values()):
+            self.attempts.append(f"no pair of images has {MIN_PAIR_INLIERS} verified matches")
+            return
+        self._attempt("incremental", self._incremental("segment.db", relaxed=False))
+        if self._enough():
+            return
+        if self.largest_output is not None:
+            start = self.largest_output
+            self._attempt("incremental, continued relaxed", self._incremental("segment.db", relaxed=True, start=start))
+        if self._enough():
+            return
+        self._attempt("incremental, relaxed start", self._incremental("segment.db", relaxed=True))
+        if self._enough():
+            return
+        self._attempt("global", self._global())
+
+    def best_models(self) -> tuple[MappedModel, ...]:
+        """Models of the attempt that placed most images in one, then what others add to it."""
+        if not self.candidates:
+            return ()
+        # Earlier rungs are stricter: a later one has to place clearly more images in its largest model.
+        best = self.candidates[0]
+        for models in self.candidates[1:]:
+            if len(models[0].images) > 1.05 * len(best[0].images):
+                best = models
+        chosen = list(best)
+        for models in self.candidates:
+            for model in models:
+                placed = {image for kept in chosen for image in kept.images}
+                if len(set(model.images) - placed) >= max(2, len(model.images) // 3):
+                    chosen.append(model)
+        return tuple(sorted(chosen, key=lambda model: -len(model.images)))
+
+    def why_not(self, image: int, placed: set[int]) -> str:
+        """Reason in words and numbers for an image in no model."""
+        links = [count for pair, count in self.inliers.items() if image in pair and count > 0]
+        to_placed = [
+            count for pair, count in self.inliers.items() if image in pair and (set(pair) - {image}) & placed and count
+        ]
+        if not links:
+            return "no verified matches to any image of its segment"
+        if not to_placed:
+            return f"matches {len(links)} images, none of which was placed"
+        return f"at most {max(to_placed)} verified matches to a placed image, and the mappers refused it"
+
+    # ------------------------------------------------------------------- attempts
+    def _attempt(self, name: str, models: dict[int, pycolmap.Reconstruction]) -> None:
+        """Record an attempt. A fold is tried again: from another start, with near pairs, then cut."""
+        found = self._convert(models, name)
+        if any(self._jumps(model) for model in found):
+            self.attempts.append(f"{name}: {self._describe_jump(found)}; once more from a relaxed start")
+            self.largest_output = None
+            found = self._convert(self._incremental("segment.db", relaxed=True), f"{name}, relaxed after a jump")
+        if any(self._jumps(model) for model in found):
+            self.attempts.append(f"{name}: {self._describe_jump(found)}; once more with near pairs only, then cut")
+            near = tuple(pair for pair in self.task.pairs if self._offset(pair) <= NEAR_OFFSET)
+            self._build_database("near.db", near)
+            again = self._convert(self._incremental("near.db", relaxed=True), f"{name}, near pairs")
+            found = [part for model in again for part in self._cut(model)]
+        accepted = []
+        for model in sorted(found, key=lambda model: -len(model.images)):
+            problem = self._problem(model)
+            if problem:
+                self.attempts.append(f"{name}: model of {len(model.images)} images refused: {problem}")
+            else:
+                accepted.append(model)
+        sizes = " + ".join(str(len(model.images)) for model in accepted) or "0"
+        self.attempts.append(f"{name}: {sizes} of {len(self.task.images)} images")
+        if accepted:
+            self.candidates.append(tuple(accepted))
+
+    def _describe_jump(self, models: Sequence[MappedModel]) -> str:
+        jumps = [(model.images[k], model.images[k + 1]) for model in models for k in self._jumps(model)]
+        first, second = jumps[0]
+        return f"{len(jumps)} jumps between neighbours that match, the first from image {first} to {second}"
+
+    def _enough(self) -> bool:
+        most = max((len(models[0].images) for models in self.candidates), default=0)
+        return most >= ENOUGH_REGISTERED * len(self.task.images)
+
+    def _incremental(
+        self, database: str, *, relaxed: bool, start: Path | None = None
+    ) -> dict[int, pycolmap.Reconstruction]:
+        options = pycolmap.IncrementalPipelineOptions()
+        options.num_threads = 1
+        options.random_seed = self.task.seed
+        options.extract_colors = False
+        options.min_model_size = self.min_images
+        options.max_model_overlap = 20
+        # COLMAP runs every adjustment to a function tolerance of 0; this stops when nothing moves any more.
+        options.ba_local_function_tolerance = 1e-6
+        options.ba_global_function_tolerance = 1e-6
+        options.ba_global_max_refinements = 3
+        options.mapper.num_threads = 1
+        options.mapper.random_seed = self.task.seed
+        options.triangulation.random_seed = self.task.seed
+        if relaxed:
+            options.mapper.init_min_tri_angle = 3.0
+            options.mapper.init_max_forward_motion = 1.0
+            options.mapper.init_min_num_inliers = 50
+            options.mapper.abs_pose_min_num_inliers = 15
+        if len(self.task.images) < 3:
+            options.mapper.init_min_tri_angle = 2.0
+        name = "incremental" if not relaxed else ("continued" if start else "relaxed")
+        output = self.scratch / (name if database == "segment.db" else f"{name}-near")
+        output.mkdir(exist_ok=True)
+        models: dict[int, pycolmap.Reconstruction] = pycolmap.incremental_mapping(
+            self.scratch / database, self.scratch, output, options, input_path=start or ""
+        )
+        if not relaxed and models:
+            largest = max(models, key=lambda number: models[number].num_reg_images())
+            self.largest_output = output / str(largest)
+        return models
+
+    def _global(self) -> dict[int, pycolmap.Reconstruction]:
+        options = pycolmap.GlobalPipelineOptions()
+        options.num_threads = 1
+        options.random_seed = self.task.seed
+        options.min_model_size = self.min_images
+        options.mapper.num_threads = 1
+        options.mapper.random_seed = self.task.seed
+        options.mapper.global_positioning.use_gpu = False
+        options.mapper.bundle_adjustment.ceres.use_gpu = False
+        output = self.scratch / "global"
+        output.mkdir(exist_ok=True)
+        models: dict[int, pycolmap.Reconstruction] = pycolmap.global_mapping(
+            self.scratch / "segment.db", self.scratch, output, options
+        )
+        return models
+
+    # ---------------------------------------------------------------------- tests
+    def _problem(self, model: MappedModel) -> str:
+        """Why a model cannot be believed, or nothing. Its pixels look perfect in every such case."""
+        if not np.isfinite(model.reprojection_error_px) or model.reprojection_error_px > 3.0:
+            return f"mean reprojection error {model.reprojection_error_px:.2f} px"
+        camera_of = dict(zip(self.task.images, self.task.camera_indices, strict=True))
+        for image, intrinsics in zip(model.images, model.intrinsics, strict=True):
+            trusted = self.task.trusted_focal.get(camera_of[image])
+            if trusted and abs(np.log(intrinsics.focal_px / trusted)) > np.log1p(FOCAL_TOLERANCE):
+                return f"focal length {intrinsics.focal_px:.0f} px, the run's is {trusted:.0f} px"
+        return ""
+
+    def _jumps(self, model: MappedModel) -> list[int]:
+        """Positions k such that image k and the next one match strongly but stand apart in the model."""
+        return find_jumps(model, self.task.images, self.inliers)
+
+    def _cut(self, model: MappedModel) -> list[MappedModel]:
+        """The model without jumps: its parts between them, those that are large enough."""
+        bounds = [0, *[k + 1 for k in self._jumps(model)], len(model.images)]
+        parts = [range(a, b) for a, b in zip(bounds, bounds[1:], strict=False) if b - a >= self.min_images]
+        return [restrict_model(model, part) for part in parts]
+
+    # ------------------------------------------------------------------- plumbing
+    def _offset(self, pair: Pair) -> int:
+        return abs(self.task.images.index(pair[0]) - self.task.images.index(pair[1]))
+
+    def _build_database(self, name: str, pairs: Sequence[Pair]) -> dict[Pair, int]:
+        """A database of this segment alone, with the cameras to start from; inliers by pair."""
+        inliers = {}
+        path = self.scratch / name
+        path.unlink(missing_ok=True)
+        with (
+            pycolmap.Database.open(self.task.database) as run,
+            pycolmap.Database.open(path) as own,
+            pycolmap.DatabaseTransaction(own),
+        ):
+            write_images(own, self.task.cameras, zip(self.task.images, self.task.camera_indices, strict=True))
+            for image in self.task.images:
+                own.write_keypoints(image + 1, run.read_keypoints(image + 1))
+            for first, second in pairs:
+                geometry = run.read_two_view_geometry(first + 1, second + 1)
+                inliers[first, second] = len(geometry.inlier_matches)
+                if len(geometry.inlier_matches):
+                    own.write_matches(first + 1, second + 1, geometry.inlier_matches)
+                    own.write_two_view_geometry(first + 1, second + 1, geometry)
+        return inliers
+
+    def _convert(self, models: dict[int, pycolmap.Reconstruction], method: str) -> list[MappedModel]:
+        converted = [model_from_reconstruction(model, method) for model in models.values()]
+        return [model for model in converted if len(model.images) >= self.min_images]
+
+
+def find_jumps(model: MappedModel, order: Sequence[int], inliers: Mapping[Pair, int]) -> list[int]:
+    """Positions k where ``model.images[k]`` and its successor in ``order`` match but stand apart.
+
+    A pair counts when it is consecutive in ``order`` and has STRONG_PAIR_INLIERS verified matches;
+    standing apart is a turn above MAX_TURN_DEG, or a step above MAX_STEP_RATIO median steps and
+    above MIN_JUMP_DEPTHS of the distance of what the first image sees.
+    """
+    place = {image: k for k, image in enumerate(order)}
+    steps = []
+    for k, (first, second) in enumerate(zip(model.images, model.images[1:], strict=False)):
+        if place[second] - place[first] == 1 and inliers.get((first, second), 0) >= STRONG_PAIR_INLIERS:
+            steps.append(k)
+    if not steps:
+        return []
+    centres = model.seg_from_cam[:, :, 3]
+    lengths = {k: float(np.linalg.norm(centres[k + 1] - centres[k])) for k in steps}
+    median = float(np.median(list(lengths.values())))
+    jumps = []
+    for k in steps:
+        relative = model.seg_from_cam[k, :, :3].T @ model.seg_from_cam[k + 1, :, :3]
+        turn_deg = np.degrees(np.arccos(np.clip((np.trace(relative) - 1) / 2, -1, 1)))
+        far = lengths[k] > MAX_STEP_RATIO * median and lengths[k] > MIN_JUMP_DEPTHS * _median_depth(model, k)
+        if turn_deg > MAX_TURN_DEG or far:
+            jumps.append(k)
+    return jumps
+
+
+def _median_depth(model: MappedModel, k: int) -> float:
+    seen = model.tracks.point_of_observation[model.tracks.image_of_observation == model.images[k]]
+    if not len(seen):
+        return 0.0
+    cam_from_seg = invert_rigid(model.seg_from_cam[k])
+    return float(np.median(model.tracks.points_seg[seen] @ cam_from_seg[2, :3] + cam_from_seg[2, 3]))
+
+
+def restrict_model(model: MappedModel, positions: Sequence[int]) -> MappedModel:
+    """The same model with only some of its images, and the points they still see at least twice."""
+    images = tuple(model.images[k] for k in positions)
+    tracks = model.tracks
+    kept = np.isin(tracks.image_of_observation, images)
+    points, compact, counts = np.unique(tracks.point_of_observation[kept], return_inverse=True, return_counts=True)
+    seen_twice = counts[compact] >= 2
+    renumber = np.cumsum(counts >= 2) - 1
+    return replace(
+        model,
+        images=images,
+        seg_from_cam=model.seg_from_cam[list(positions)],
+        intrinsics=tuple(model.intrinsics[k] for k in positions),
+        tracks=Tracks(
+            points_seg=tracks.points_seg[points[counts >= 2]],
+            point_of_observation=renumber[compact][seen_twice],
+            image_of_observation=tracks.image_of_observation[kept][seen_twice],
+            feature_of_observation=tracks.feature_of_observation[kept][seen_twice],
+        ),
+        method=f"{model.method}, cut",
+    )
+
+
+def model_from_reconstruction(reconstruction: pycolmap.Reconstruction, method: str) -> MappedModel:
+    """Arrays of a pycolmap model whose image ids are index + 1; images ascend."""
+    ids = sorted(reconstruction.reg_image_ids())
+    poses = [reconstruction.image(i).cam_from_world().inverse().matrix() for i in ids]
+    intrinsics = [Intrinsics.from_colmap(reconstruction.camera(reconstruction.image(i).camera_id)) for i in ids]
+    points, owner, image, feature = [], [], [], []
+    for row, point_id in enumerate(sorted(reconstruction.points3D)):
+        point = reconstruction.points3D[point_id]
+        points.append(point.xyz)
+        for element in point.track.elements:
+            owner.append(row)
+            image.append(element.image_id - 1)
+            feature.append(element.point2D_idx)
+    return MappedModel(
+        images=tuple(i - 1 for i in ids),
+        seg_from_cam=np.array(poses, dtype=np.float64).reshape(-1, 3, 4),
+        intrinsics=tuple(intrinsics),
+        tracks=Tracks(
+            points_seg=np.array(points, dtype=np.float64).reshape(-1, 3),
+            point_of_observation=np.array(owner, dtype=np.int64),
+            image_of_observation=np.array(image, dtype=np.int64),
+            feature_of_observation=np.array(feature, dtype=np.int64),
+        ),
+        reprojection_error_px=float(reconstruction.compute_mean_reprojection_error()),
+        method=method,
+    )

@@ -1,0 +1,550 @@
+"""From chained pieces to one scene: every image one pose, every camera one calibration, one cloud.
+
+Pieces overlap, so most images were reconstructed twice. Their poses are averaged, calibrations are
+voted on, and of the dense maps one per image is used, hung on the averaged pose so that cloud and
+cameras agree. All of it takes values and returns values; maps are read one image at a time.
+The next modules to read are the exporters.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+import numpy.typing as npt
+
+from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
+from smust3r_colmap.products import (
+    DenseMaps,
+    FloatArray,
+    ImageCollection,
+    IntArray,
+    PointCloud,
+    Scene,
+    SegmentPiece,
+)
+
+OUTLIER_RATIO = 5.0
+"""A pose is left out beyond this many times the usual disagreement of its two pieces. Drift that grows
+along an overlap reaches two to four times its own median, and is to be blended, not cut."""
+SAMPLES_PER_POINT = 4
+"""Pixels gathered per fused point: enough for every voxel to be an average, few enough for memory."""
+FULL_ENOUGH = 0.9
+"""The search for the voxel size stops between this part of ``max_points`` and all of it."""
+ENOUGH_SEEN_TWICE = 0.5
+"""Voxels seen by one image only are dropped where at least this part of the cloud stays."""
+DEPTH_JUMP = 0.1
+"""Neighbours whose depths differ by more than this part belong to two surfaces and give no normal."""
+NO_NORMAL_WEIGHT = 1e-3
+"""Weight of the viewing direction where a pixel has no normal: it counts where nothing else does."""
+
+_CELL_BITS = 21  # three axes of 21 bits fill an int64 without its sign
+
+
+# ---------------------------------------------------------------------------- cameras
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FusedCameras:
+    """One pose per image of a connected part, with what the pieces said about each other.
+
+    Args:
+        images: (N,) indices into the collection, ascending.
+        cam_from_world: (N, 3, 4) rigid.
+        num_pieces: (N,) pieces that hold the image.
+        num_dropped: (N,) of these, poses left out because they disagree with the rest.
+        best_piece: (N,) position of the piece, among those used, where the image lies most central.
+        position_spread: (N,) largest distance between two pieces' centres of the image, as a part of
+            ``scene_radius``; dropped poses count too; NaN where one piece holds the image.
+        rotation_spread_deg: (N,) the same for the rotations, in degrees.
+        scene_radius: median distance of the camera centres from their median, in world units.
+    """
+
+    images: tuple[int, ...]
+    cam_from_world: FloatArray
+    num_pieces: IntArray
+    num_dropped: IntArray
+    best_piece: IntArray
+    position_spread: FloatArray
+    rotation_spread_deg: FloatArray
+    scene_radius: float
+
+    def __post_init__(self) -> None:
+        n = len(self.images)
+        for name in ("num_pieces", "num_dropped", "best_piece", "position_spread", "rotation_spread_deg"):
+            if getattr(self, name).shape != (n,):
+                raise ValueError(f"FusedCameras: {n} images, {name} {getattr(self, name).shape}")
+        if self.cam_from_world.shape != (n, 3, 4) or not np.isfinite(self.cam_from_world).all():
+            raise ValueError(f"FusedCameras: {n} images, poses {self.cam_from_world.shape}, or one is not finite")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Sightings:
+    """What the pieces say about one image; leading axis: the pieces that hold it."""
+
+    pieces: tuple[int, ...]
+    world_from_cam: FloatArray  # (K, 3, 4)
+    weights: FloatArray  # (K,) centrality
+
+    def disagreement(self) -> tuple[FloatArray, FloatArray]:
+        """(K, K) distances of the centres and (K, K) angles in degrees between the rotations."""
+        centres, rotations = self.world_from_cam[:, :, 3], self.world_from_cam[:, :, :3]
+        distances = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+        # |R_a - R_b|_F = 2 sqrt(2) sin(angle / 2), exact also for tiny angles, unlike the trace.
+        chord = np.linalg.norm(rotations[:, None] - rotations[None], axis=(-2, -1))
+        angles_deg = np.rad2deg(2 * np.arcsin(np.minimum(chord / np.sqrt(8), 1)))
+        return distances, angles_deg
+
+
+def fuse_cameras(pieces: Sequence[SegmentPiece], world_from_seg: Sequence[Sim3]) -> FusedCameras:
+    """One pose per image: centres by weighted mean, rotations by weighted chordal mean.
+
+    The weight is the image's ``centrality`` in each piece, so through an overlap the trajectory passes
+    steadily from one piece to the next. Poses that disagree are treated in two ways. A disagreement as
+    large as usual between these two pieces is drift: it is blended. A pose farther than
+    ``OUTLIER_RATIO`` times that from the weighted medoid of its image is an accident of one piece: it
+    is left out and counted. Of three poses the medoid is the majority, of two the more central one.
+    An accident is told from drift where two pieces share at least three images; two that disagree on
+    every image they share are blended all the same, and the spread tells.
+
+    Args:
+        pieces: of one connected part.
+        world_from_seg: one per piece.
+
+    Raises:
+        ValueError: no piece, or another number of transforms than of pieces.
+
+    Source: chordal mean after Hartley, Trumpf, Dai and Li, Rotation Averaging, IJCV 2013.
+    """
+    _check_one_each(pieces, world_from_seg)
+    sightings = _sightings_by_image(pieces, world_from_seg)
+    centres = np.concatenate([sighting.world_from_cam[:, :, 3] for sighting in sightings.values()])
+    radius = float(np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
+    usual = _usual_disagreement(sightings.values(), radius)
+    kept = [_agreeing(sighting, usual) for sighting in sightings.values()]
+    spread = [[matrix.max() for matrix in sighting.disagreement()] for sighting in sightings.values()]
+    alone = np.array([len(sighting.pieces) == 1 for sighting in sightings.values()])
+    distance, angle_deg = np.array(spread).T
+    world_from_cam = np.stack(
+        [
+            _mean_pose(sighting.world_from_cam[keep], sighting.weights[keep])
+            for sighting, keep in zip(sightings.values(), kept, strict=True)
+        ]
+    )
+    return FusedCameras(
+        images=tuple(sightings),
+        cam_from_world=invert_rigid(world_from_cam),
+        num_pieces=np.array([len(keep) for keep in kept]),
+        num_dropped=np.array([np.count_nonzero(~keep) for keep in kept]),
+        best_piece=np.array(
+            [
+                sighting.pieces[int(np.argmax(np.where(keep, sighting.weights, 0)))]
+                for sighting, keep in zip(sightings.values(), kept, strict=True)
+            ]
+        ),
+        position_spread=np.where(alone, np.nan, distance / radius if radius > 0 else distance),
+        rotation_spread_deg=np.where(alone, np.nan, angle_deg),
+        scene_radius=radius,
+    )
+
+
+def centrality(num_images: int) -> FloatArray:
+    """(N,) weight of each image of a piece, in (0, 1]: falls linearly from the middle to the ends.
+
+    An image in the middle of a segment has neighbours on both sides, one at its end on one side only.
+    """
+    to_end = np.minimum(np.arange(num_images), np.arange(num_images)[::-1]) + 1
+    weights: FloatArray = to_end / to_end.max()
+    return weights
+
+
+def _check_one_each(pieces: Sequence[SegmentPiece], others: Sequence[object]) -> None:
+    if not pieces or len(pieces) != len(others):
+        raise ValueError(f"fusion: {len(pieces)} pieces and {len(others)} companions; needed one each, at least one")
+
+
+def _sightings_by_image(pieces: Sequence[SegmentPiece], world_from_seg: Sequence[Sim3]) -> dict[int, _Sightings]:
+    """Per image, ascending, what each piece that holds it says."""
+    found: dict[int, list[tuple[int, FloatArray, float]]] = defaultdict(list)
+    for position, (piece, world_from) in enumerate(zip(pieces, world_from_seg, strict=True)):
+        poses = world_from.move_cameras(piece.seg_from_cam)
+        for image, pose, weight in zip(piece.images, poses, centrality(len(piece.images)), strict=True):
+            found[image].append((position, pose, weight))
+    return {
+        image: _Sightings(
+            pieces=tuple(position for position, _, _ in found[image]),
+            world_from_cam=np.stack([pose for _, pose, _ in found[image]]),
+            weights=np.array([weight for _, _, weight in found[image]]),
+        )
+        for image in sorted(found)
+    }
+
+
+def _usual_disagreement(sightings: Iterable[_Sightings], radius: float) -> dict[tuple[int, int], tuple[float, float]]:
+    """Per pair of pieces, the median distance and angle in degrees over the images they share.
+
+    Never less than rounding: 1e-6 of the scene's radius and 1e-4 degrees.
+    """
+    found: dict[tuple[int, int], list[tuple[float, float]]] = defaultdict(list)
+    for sighting in sightings:
+        distances, angles_deg = sighting.disagreement()
+        for a, b in combinations(range(len(sighting.pieces)), 2):
+            found[sighting.pieces[a], sighting.pieces[b]].append((distances[a, b], angles_deg[a, b]))
+    usual = {}
+    for pair, values in found.items():
+        distance, angle_deg = np.median(values, axis=0)
+        usual[pair] = (max(float(distance), 1e-6 * radius), max(float(angle_deg), 1e-4))
+    return usual
+
+
+def _agreeing(sighting: _Sightings, usual: dict[tuple[int, int], tuple[float, float]]) -> npt.NDArray[np.bool_]:
+    """(K,) which poses lie near the weighted medoid, in units of the usual disagreement."""
+    distances, angles_deg = sighting.disagreement()
+    ratio = np.zeros_like(distances)
+    for a, b in combinations(range(len(sighting.pieces)), 2):
+        usual_distance, usual_angle_deg = usual[sighting.pieces[a], sighting.pieces[b]]
+        by_distance = distances[a, b] / usual_distance if usual_distance > 0 else 0.0
+        ratio[a, b] = ratio[b, a] = max(by_distance, angles_deg[a, b] / usual_angle_deg)
+    medoid = int(np.argmin(ratio @ sighting.weights))
+    agreeing: npt.NDArray[np.bool_] = ratio[medoid] <= OUTLIER_RATIO
+    return agreeing
+
+
+def _mean_pose(world_from_cam: FloatArray, weights: FloatArray) -> FloatArray:
+    """Weighted mean (3, 4) of rigid poses (K, 3, 4)."""
+    mean = np.average(world_from_cam, axis=0, weights=weights)
+    u, _, vt = np.linalg.svd(mean[:, :3])
+    # The rotation nearest to the mean matrix minimises the sum of squared chordal distances.
+    mean[:, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return mean
+
+
+# ------------------------------------------------------------------------- intrinsics
+def fuse_intrinsics(pieces: Sequence[SegmentPiece], camera_of_image: Sequence[int]) -> dict[int, Intrinsics]:
+    """One calibration per camera: the median of each parameter over all registered images.
+
+    A piece counts as often as it registered an image of the camera. Where pieces disagree about the
+    camera model, the model of most images is taken and the others have no say.
+
+    Args:
+        pieces: of one connected part, intrinsics at the original image size.
+        camera_of_image: camera of every image of the collection.
+
+    Returns:
+        By camera index, ascending; only cameras with a registered image.
+
+    Raises:
+        ValueError: two pieces hold one camera at different image sizes.
+    """
+    found: dict[int, list[Intrinsics]] = defaultdict(list)
+    for piece in pieces:
+        for image, intrinsics in zip(piece.images, piece.intrinsics, strict=True):
+            found[camera_of_image[image]].append(intrinsics)
+    return {camera: _median_intrinsics(camera, found[camera]) for camera in sorted(found)}
+
+
+def _median_intrinsics(camera: int, candidates: Sequence[Intrinsics]) -> Intrinsics:
+    """The median of those that have the most frequent model."""
+    sizes = {(candidate.width, candidate.height) for candidate in candidates}
+    if len(sizes) > 1:
+        raise ValueError(f"camera {camera}: pieces hold it at sizes {sorted(sizes)}, needed the original size only")
+    model = Counter(candidate.model for candidate in candidates).most_common(1)[0][0]
+    same = [candidate for candidate in candidates if candidate.model == model]
+    params = np.median([candidate.params for candidate in same], axis=0)
+    prior = all(candidate.has_prior_focal for candidate in same)
+    return replace(same[0], params=tuple(params), has_prior_focal=prior)
+
+
+# ----------------------------------------------------------------------------- points
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FusedPoints:
+    """The cloud of a connected part, with what became of the pixels.
+
+    Args:
+        cloud: in the world frame, with normals.
+        voxel_size: edge of the cells that were averaged, in world units; NaN for an empty cloud.
+        num_pixels: confident pixels of all maps used.
+        num_samples: of these, gathered.
+        num_far: samples dropped because they lie more than a million voxels from the middle.
+        num_seen_once: voxels dropped because one image only saw them.
+    """
+
+    cloud: PointCloud
+    voxel_size: float
+    num_pixels: int
+    num_samples: int
+    num_far: int
+    num_seen_once: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Samples:
+    """Pixels in space, ordered by image; positions relative to an origin so that float32 holds them."""
+
+    xyz: npt.NDArray[np.float32]  # (S, 3)
+    normals: npt.NDArray[np.float32]  # (S, 3), length 1, or NO_NORMAL_WEIGHT where unknown
+    rgb: npt.NDArray[np.uint8]  # (S, 3)
+    image: npt.NDArray[np.int32]  # (S,)
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    @classmethod
+    def joined(cls, parts: Sequence[_Samples]) -> _Samples:
+        return cls(
+            xyz=np.concatenate([part.xyz for part in parts]),
+            normals=np.concatenate([part.normals for part in parts]),
+            rgb=np.concatenate([part.rgb for part in parts]),
+            image=np.concatenate([part.image for part in parts]),
+        )
+
+    def selected(self, rows: npt.NDArray[np.bool_]) -> _Samples:
+        return _Samples(xyz=self.xyz[rows], normals=self.normals[rows], rgb=self.rgb[rows], image=self.image[rows])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Surface:
+    """The confident pixels of one map, row by row, in its camera's axes and in world units."""
+
+    points_cam: FloatArray  # (M, 3)
+    normals_cam: FloatArray  # (M, 3)
+    rgb: npt.NDArray[np.uint8]  # (M, 3)
+    spacing: float  # usual distance of neighbouring pixels, NaN where there are none
+
+    def sampled(self, quota: int, image: int, world_from_cam: FloatArray, origin: FloatArray) -> _Samples:
+        """At most ``quota`` pixels, evenly spread, turned into the world and moved by ``-origin``."""
+        count = min(quota, len(self.points_cam))
+        rows = np.arange(count) * len(self.points_cam) // max(count, 1)
+        rotation, centre = world_from_cam[:, :3], world_from_cam[:, 3]
+        return _Samples(
+            xyz=(self.points_cam[rows] @ rotation.T + (centre - origin)).astype(np.float32),
+            normals=(self.normals_cam[rows] @ rotation.T).astype(np.float32),
+            rgb=self.rgb[rows],
+            image=np.full(count, image, dtype=np.int32),
+        )
+
+
+def fuse_points(
+    pieces: Sequence[SegmentPiece],
+    dense: Sequence[DenseMaps],
+    world_from_seg: Sequence[Sim3],
+    cameras: FusedCameras,
+    *,
+    max_points: int,
+    min_confidence: float,
+) -> FusedPoints:
+    """The confident pixels of all maps as one cloud, averaged over the cells of a regular grid.
+
+    Each image gives its map once, from ``cameras.best_piece``. The pointmap is taken into the camera
+    by the pose that the piece itself gave the image, scaled by the piece's ``world_from_seg``, and
+    placed by the *fused* pose. For maps that are depth unprojected this is depth times scale along the
+    rays of the piece's own intrinsics (those made the depth, the fused ones did not); maps that carry
+    more than depth keep it.
+
+    Cells start at the usual distance of neighbouring pixels and grow until ``max_points`` suffice.
+    Cells that one image only saw are dropped where at least half of the cloud stays. Normals come from
+    neighbouring pixels, face the camera, and are averaged; where no pixel of a cell has one (rims,
+    depth jumps) the normal points to the cameras. The result depends on nothing but the arguments.
+
+    Memory: about 100 bytes x ``SAMPLES_PER_POINT`` x ``max_points``, and one image's maps.
+
+    Args:
+        pieces, dense, world_from_seg: one each, of one connected part.
+        cameras: ``fuse_cameras`` of the same pieces.
+        max_points: upper bound of the cloud, at least 1.
+        min_confidence: pixels below are left out.
+
+    Raises:
+        ValueError: numbers of pieces, maps and transforms differ, or ``max_points`` is below 1.
+    """
+    _check_one_each(pieces, dense)
+    _check_one_each(pieces, world_from_seg)
+    if max_points < 1:
+        raise ValueError(f"max_points is {max_points}, needed at least 1")
+    quota = -(-SAMPLES_PER_POINT * max_points // len(cameras.images))
+    origin = np.median(invert_rigid(cameras.cam_from_world)[:, :, 3], axis=0)
+    samples, spacing, num_pixels = _gathered(
+        pieces, dense, world_from_seg, cameras, origin=origin, quota=quota, min_confidence=min_confidence
+    )
+    if not len(samples):
+        return FusedPoints(
+            cloud=PointCloud(
+                xyz=np.empty((0, 3)), rgb=np.empty((0, 3), np.uint8), normals=np.empty((0, 3), np.float32)
+            ),
+            voxel_size=np.nan,
+            num_pixels=0,
+            num_samples=0,
+            num_far=0,
+            num_seen_once=0,
+        )
+    near = _within_reach(samples.xyz, spacing)
+    nearby = samples if near.all() else samples.selected(near)
+    voxel_size = _voxel_size(nearby.xyz, spacing, max_points)
+    cloud, num_seen_once = _averaged(nearby, _cells(nearby.xyz, voxel_size), origin)
+    return FusedPoints(
+        cloud=cloud,
+        voxel_size=voxel_size,
+        num_pixels=num_pixels,
+        num_samples=len(samples),
+        num_far=len(samples) - len(nearby),
+        num_seen_once=num_seen_once,
+    )
+
+
+def surface_normals(points_cam: FloatArray) -> FloatArray:
+    """Normals (H, W, 3) of a pointmap (H, W, 3) in the camera frame, facing the camera.
+
+    The cross product of the central differences along both axes, one-sided at the rim. Length 1; a
+    viewing direction of length ``NO_NORMAL_WEIGHT`` where a neighbour is NaN or across a depth jump.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        padded = np.pad(points_cam, ((1, 1), (1, 1), (0, 0)), mode="edge")
+        along_x = padded[1:-1, 2:] - padded[1:-1, :-2]
+        along_y = padded[2:, 1:-1] - padded[:-2, 1:-1]
+        normals = _unit(np.cross(along_x, along_y))
+        away = np.einsum("hwi,hwi->hw", normals, points_cam) > 0
+        normals[away] *= -1
+        steps = np.maximum(np.abs(along_x[..., 2]), np.abs(along_y[..., 2]))
+        known = np.isfinite(normals).all(axis=-1) & (steps <= DEPTH_JUMP * points_cam[..., 2])
+        return np.where(known[..., None], normals, -NO_NORMAL_WEIGHT * _unit(points_cam))
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    unit: FloatArray = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return unit
+
+
+def _surface(maps: DenseMaps, k: int, seg_from_cam: FloatArray, scale: float, min_confidence: float) -> _Surface:
+    """Image ``k`` of a piece, moved from the segment into its camera and scaled to the world."""
+    cam_from_seg = invert_rigid(seg_from_cam)
+    points_cam = scale * (maps.pointmap_seg(k) @ cam_from_seg[:, :3].T + cam_from_seg[:, 3])
+    confident = np.isfinite(points_cam).all(axis=-1) & (maps.confidence(k) >= min_confidence)
+    confident &= np.nan_to_num(points_cam[..., 2]) > 0
+    to_neighbour = np.linalg.norm(np.diff(points_cam, axis=1), axis=-1)[confident[:, 1:]]
+    to_neighbour = to_neighbour[np.isfinite(to_neighbour)]
+    return _Surface(
+        points_cam=points_cam[confident],
+        normals_cam=surface_normals(points_cam)[confident],
+        rgb=maps.rgb(k)[confident],
+        spacing=float(np.median(to_neighbour)) if len(to_neighbour) else np.nan,
+    )
+
+
+def _gathered(
+    pieces: Sequence[SegmentPiece],
+    dense: Sequence[DenseMaps],
+    world_from_seg: Sequence[Sim3],
+    cameras: FusedCameras,
+    *,
+    origin: FloatArray,
+    quota: int,
+    min_confidence: float,
+) -> tuple[_Samples, float, int]:
+    """Samples of all images, the usual distance of neighbouring pixels, and the number of pixels."""
+    parts, spacings, num_pixels = [], [], 0
+    world_from_cam = invert_rigid(cameras.cam_from_world)
+    for image, best, pose in zip(cameras.images, cameras.best_piece, world_from_cam, strict=True):
+        k = pieces[best].images.index(image)
+        scale = float(world_from_seg[best].scale)
+        surface = _surface(dense[best], k, pieces[best].seg_from_cam[k], scale, min_confidence)
+        parts.append(surface.sampled(quota, image, pose, origin))
+        spacings += [surface.spacing] if np.isfinite(surface.spacing) else []
+        num_pixels += len(surface.points_cam)
+    samples = _Samples.joined(parts)
+    spacing = float(np.median(spacings)) if spacings else 0.0
+    if spacing == 0 and len(samples):  # maps one pixel wide, or all pixels in one place
+        spacing = float(np.ptp(samples.xyz, axis=0).max()) * 2.0 ** (1 - _CELL_BITS) or 1.0
+    return samples, spacing, num_pixels
+
+
+def _within_reach(xyz: npt.NDArray[np.float32], spacing: float) -> npt.NDArray[np.bool_]:
+    """(S,) which samples a grid of the finest cells around the middle can number."""
+    reach = spacing * 2 ** (_CELL_BITS - 1)
+    near: npt.NDArray[np.bool_] = (np.abs(xyz - np.median(xyz, axis=0)) < reach).all(axis=-1)
+    return near
+
+
+def _cells(xyz: npt.NDArray[np.float32], voxel_size: float) -> IntArray:
+    """(S,) one number per cell of a grid that starts at the lowest corner."""
+    along = np.floor((xyz - xyz.min(axis=0)) / np.float64(voxel_size)).astype(np.int64)
+    cells: IntArray = (along[:, 0] << 2 * _CELL_BITS) | (along[:, 1] << _CELL_BITS) | along[:, 2]
+    return cells
+
+
+def _voxel_size(xyz: npt.NDArray[np.float32], finest: float, max_points: int) -> float:
+    """The smallest size, not below ``finest``, at which at most ``max_points`` cells are occupied.
+
+    Found by growing, then halving the bracket, to within ``FULL_ENOUGH`` or 2 percent of the size.
+    """
+    too_small, size = finest, finest
+    count = len(np.unique(_cells(xyz, size)))
+    while count > max_points:
+        too_small = size
+        size *= 1.05 * np.sqrt(count / max_points)  # a surface occupies cells as size ** -2
+        count = len(np.unique(_cells(xyz, size)))
+    while count < FULL_ENOUGH * max_points and size > 1.02 * too_small:
+        middle = float(np.sqrt(too_small * size))
+        count_middle = len(np.unique(_cells(xyz, middle)))
+        if count_middle > max_points:
+            too_small = middle
+        else:
+            size, count = middle, count_middle
+    return float(size)
+
+
+def _averaged(samples: _Samples, cells: IntArray, origin: FloatArray) -> tuple[PointCloud, int]:
+    """One point per cell, by rising cell number, and how many cells were dropped as seen once."""
+    order = np.argsort(cells, kind="stable")
+    starts = np.flatnonzero(np.diff(cells[order], prepend=-1))
+    ends = np.append(starts[1:], len(order))
+    # Samples are ordered by image and the sort is stable, so first and last tell of a second image.
+    seen_twice = samples.image[order[starts]] != samples.image[order[ends - 1]]
+    kept = seen_twice if seen_twice.mean() >= ENOUGH_SEEN_TWICE else np.ones_like(seen_twice)
+
+    def sums(values: npt.NDArray[np.float32] | npt.NDArray[np.uint8]) -> FloatArray:
+        columns = [np.add.reduceat(column[order].astype(np.float64), starts)[kept] for column in values.T]
+        return np.column_stack(columns)
+
+    counts = (ends - starts)[kept, None]
+    normals = sums(samples.normals)
+    cancelled = np.linalg.norm(normals, axis=1) < NO_NORMAL_WEIGHT / 2  # thin walls seen from both sides
+    normals[cancelled] = samples.normals[order[starts[kept][cancelled]]]
+    cloud = PointCloud(
+        xyz=origin + sums(samples.xyz) / counts,
+        rgb=np.rint(sums(samples.rgb) / counts).astype(np.uint8),
+        normals=_unit(normals).astype(np.float32),
+    )
+    return cloud, int(np.count_nonzero(~kept))
+
+
+# ------------------------------------------------------------------------------ scene
+def build_scene(
+    collection: ImageCollection,
+    pieces: Sequence[SegmentPiece],
+    cameras: FusedCameras,
+    intrinsics: dict[int, Intrinsics],
+    points: PointCloud,
+    *,
+    metric: bool,
+) -> Scene:
+    """Put the fused parts together under the names of the collection.
+
+    Args:
+        collection: all images of the run.
+        pieces: of this connected part; the first is the world frame.
+        cameras, intrinsics, points: what the three fusions made of them.
+        metric: lengths are metres.
+    """
+    images = [collection.images[image] for image in cameras.images]
+    return Scene(
+        image_indices=cameras.images,
+        image_names=tuple(image.name for image in images),
+        camera_indices=tuple(image.camera for image in images),
+        cameras=intrinsics,
+        cam_from_world=cameras.cam_from_world,
+        points=points,
+        metric=metric,
+        segments=tuple(piece.name for piece in pieces),
+    )

@@ -1,0 +1,241 @@
+"""Where everything lies, and how a run takes up where it was left.
+
+    OUT/
+      sparse/0/ 1/ ...     COLMAP models, largest first
+      points.ply  scene.glb  trajectory_tum.txt
+      summary.json  config.toml
+      work/
+        lock               held by the process that writes
+        native.log         messages of pycolmap's native code
+        import/            what was read of each file
+        features/          database.db: keypoints, descriptors, matches, ids = index + 1
+        segments/0000/     mapping/  calibrated/  depth_0/  depth_1/ ...
+        alignment/
+
+A stage is a folder. It is written aside (``NAME.partial``) and renamed, with a ``stage.json`` that
+holds the key: a hash of its inputs and settings. A folder whose key is as expected is finished and
+is read; any other is made again. Arrays are safetensors, facts are JSON, nothing is pickled.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import safetensors
+import safetensors.numpy
+from filelock import FileLock, Timeout
+
+from smust3r_colmap.errors import RunDirectoryError, RunLockedError, StorageError
+
+FORMAT_VERSION = 1
+"""Part of every key; a change of what a stage stores or computes raises it."""
+
+_STAGE_FILE = "stage.json"
+
+
+class RunDirectory:
+    """The output folder of one run, held by one process at a time.
+
+    Args:
+        root: made when missing.
+        fresh: throw away what an earlier run left in ``work`` and the results.
+
+    Raises:
+        RunLockedError: another living process holds it.
+        RunDirectoryError: the path is a file, or a folder with other things in it.
+        StorageError: the disk refused.
+    """
+
+    RESULTS = ("sparse", "points.ply", "scene.glb", "trajectory_tum.txt", "summary.json", "config.toml")
+
+    def __init__(self, root: Path, *, fresh: bool = False) -> None:
+        self.root = root
+        if root.exists() and not root.is_dir():
+            raise RunDirectoryError(f"{root}: is a file; --output must name a folder")
+        if root.is_dir() and any(root.iterdir()) and not self.work.is_dir():
+            raise RunDirectoryError(f"{root}: is not empty and was not made by this program; name another folder")
+        with storage_errors(root):
+            self.work.mkdir(parents=True, exist_ok=True)
+        self._lock = FileLock(self.work / "lock")
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout:
+            raise RunLockedError(f"{root}: another process is writing here; wait for it or stop it") from None
+        with storage_errors(root):
+            if fresh:
+                self._clear()
+            for left_over in self.work.rglob("*.partial*"):
+                _remove(left_over)
+
+    def __enter__(self) -> RunDirectory:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._lock.release()
+
+    @property
+    def work(self) -> Path:
+        """Intermediate products, kept so that the next start can go on."""
+        return self.root / "work"
+
+    @property
+    def native_log(self) -> Path:
+        """Messages of native code in the child processes."""
+        return self.work / "native.log"
+
+    @property
+    def import_records(self) -> Path:
+        """What the importer learnt of each file, so that an unchanged file is not read again."""
+        return self.work / "import" / "records.json"
+
+    def stage(self, *names: str, key: str) -> StageFolder:
+        """The stage at ``work/NAMES...`` that is finished only under this key."""
+        return StageFolder(path=self.work.joinpath(*names), key=key)
+
+    def sparse_model(self, index: int) -> Path:
+        """Folder of the COLMAP model number ``index``."""
+        return self.root / "sparse" / str(index)
+
+    def clear_results(self) -> None:
+        """Remove the results of an earlier run, so that none of them outlives its inputs."""
+        for name in self.RESULTS:
+            _remove(self.root / name)
+
+    def _clear(self) -> None:
+        self.clear_results()
+        for path in self.work.iterdir():
+            if path.name != "lock":
+                _remove(path)
+
+
+class StageFolder:
+    """One folder that is either finished under its key or not there at all."""
+
+    def __init__(self, *, path: Path, key: str) -> None:
+        self.path = path
+        self.key = key
+
+    @property
+    def is_done(self) -> bool:
+        """The folder is complete and was made from the same inputs and settings."""
+        try:
+            facts = json.loads((self.path / _STAGE_FILE).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return False
+        return isinstance(facts, dict) and facts.get("key") == self.key
+
+    @contextmanager
+    def write(self) -> Iterator[Path]:
+        """A folder to write into; it becomes the stage when the block ends without an error.
+
+        It may be called in a child process. The name carries the process id, so that a child that
+        outlives a killed parent by a moment cannot touch what the next run writes.
+        """
+        aside = self.path.with_name(f"{self.path.name}.partial-{os.getpid()}")
+        with storage_errors(self.path):
+            _remove(aside)
+            aside.mkdir(parents=True)
+            yield aside
+            write_json(aside / _STAGE_FILE, {"key": self.key})
+            _remove(self.path)
+            os.replace(aside, self.path)
+
+    def open_in_place(self) -> Path:
+        """For a store with transactions of its own: the folder, emptied if its key is another's."""
+        with storage_errors(self.path):
+            if not self.is_done:
+                _remove(self.path)
+                self.path.mkdir(parents=True)
+                write_json(self.path / _STAGE_FILE, {"key": self.key})
+        return self.path
+
+
+def key_of(*parts: object) -> str:
+    """A hash of inputs and settings (JSON-able values, dataclasses, other keys)."""
+    text = json.dumps([FORMAT_VERSION, *parts], sort_keys=True, default=_hashable, ensure_ascii=False)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def write_json(path: Path, facts: object) -> None:
+    """Write ``facts`` aside and rename, so that the file is whole or absent."""
+    aside = path.with_name(path.name + ".partial")
+    with storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        aside.write_text(
+            json.dumps(facts, indent=1, default=_jsonable, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8"
+        )
+        os.replace(aside, path)
+
+
+def read_json(path: Path) -> Any:
+    """The JSON in ``path``; StorageError when it cannot be read."""
+    with storage_errors(path):
+        return json.loads(path.read_text(encoding="utf-8"))
+
+
+def write_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    """Write named arrays as one safetensors file."""
+    with storage_errors(path):
+        safetensors.numpy.save_file({name: np.ascontiguousarray(value) for name, value in arrays.items()}, path)
+
+
+def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
+    """All arrays of a safetensors file, in memory."""
+    with storage_errors(path):
+        return dict(safetensors.numpy.load_file(path))
+
+
+def read_array(path: Path, name: str) -> npt.NDArray[Any]:
+    """One array of a safetensors file; the others are not read."""
+    with storage_errors(path), safetensors.safe_open(path, framework="numpy") as file:
+        array: npt.NDArray[Any] = file.get_tensor(name)
+        return array
+
+
+@contextmanager
+def storage_errors(path: Path) -> Iterator[None]:
+    """Turn what the disk refuses into a StorageError that names the path."""
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(f"{path}: {error.strerror or error}; finished stages are kept") from error
+    except safetensors.SafetensorError as error:
+        raise StorageError(f"{path}: {error}; finished stages are kept") from error
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _hashable(value: object) -> object:
+    """As ``_jsonable``, but arrays by the hash of their bytes, and dataclasses with arrays inside."""
+    if isinstance(value, np.ndarray):
+        return [str(value.dtype), value.shape, hashlib.blake2b(value.tobytes(), digest_size=16).hexdigest()]
+    if is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in fields(value)}
+    return _jsonable(value)
+
+
+def _jsonable(value: object) -> object:
+    if is_dataclass(value) and not isinstance(value, type):
+        return asdict(value)
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} is not JSON")

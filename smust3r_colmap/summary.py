@@ -1,0 +1,230 @@
+"""What came out of a run, for people (``render_text``), programs (``to_json_dict``) and the shell.
+
+The pipeline fills a ``RunSummary`` at its end; nothing here measures or decides anything about
+geometry. The next module to read is ``cli``, which prints it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from smust3r_colmap.progress import format_seconds
+
+EXIT_GOOD = 0
+EXIT_WEAK = 3
+
+# More names than this are counted, not listed, in the text for people; the JSON has them all.
+_NAMES_SHOWN = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelSummary:
+    """One COLMAP model.
+
+    Args:
+        folder: relative to the output folder, with forward slashes, such as ``sparse/0``.
+        num_images: images with a pose in this model.
+        num_points: points of its fused cloud.
+        metric: lengths are metres.
+        segments: names of the segment pieces that were stitched.
+    """
+
+    folder: str
+    num_images: int
+    num_points: int
+    metric: bool
+    segments: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageRemark:
+    """An image that is missing from the result, and why."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageSummary:
+    """What a stage cost.
+
+    Args:
+        name: as in the progress report.
+        wall_s: time that went by.
+        cpu_s: processor time, child processes included.
+        reused: everything was found finished by an earlier run.
+    """
+
+    name: str
+    wall_s: float
+    cpu_s: float
+    reused: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentSummary:
+    """What a backbone made of a segment.
+
+    Args:
+        index: of the segment in the plan.
+        num_images: images it was given.
+        num_pieces: connected pieces that came out; 0 when nothing did.
+        num_registered: images with a pose, over all its pieces.
+        method: how its largest piece was made, in words; empty when nothing came out.
+    """
+
+    index: int
+    num_images: int
+    num_pieces: int
+    num_registered: int
+    method: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class EdgeSummary:
+    """An alignment between two segment pieces.
+
+    Args:
+        target, source: names of the pieces.
+        relative_residual: median residual divided by depth; NaN when no transform was found.
+        accepted: it took part in the stitching.
+        reason: why it was refused, or empty.
+    """
+
+    target: str
+    source: str
+    relative_residual: float
+    accepted: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSummary:
+    """The whole run.
+
+    Args:
+        output: the output folder.
+        num_images: images that could be read.
+        num_registered: distinct images with a pose in at least one model.
+        models: largest first.
+        rejected: files that could not be used.
+        unregistered: images that were read but have no pose in any model.
+        stages: in the order in which they ran.
+        segments: in the order of the plan.
+        edges: alignments that were tried.
+        peak_memory_bytes: largest resident size of this process or of one of its children.
+
+    Raises:
+        ValueError: the counts contradict each other, or there is no model.
+    """
+
+    output: Path
+    num_images: int
+    num_registered: int
+    models: tuple[ModelSummary, ...]
+    rejected: tuple[ImageRemark, ...]
+    unregistered: tuple[ImageRemark, ...]
+    stages: tuple[StageSummary, ...]
+    segments: tuple[SegmentSummary, ...]
+    edges: tuple[EdgeSummary, ...]
+    peak_memory_bytes: int
+
+    def __post_init__(self) -> None:
+        if not self.models:
+            raise ValueError("RunSummary: a run without a model has failed and has no summary")
+        if self.num_registered + len(self.unregistered) != self.num_images:
+            raise ValueError(
+                f"RunSummary: {self.num_registered} registered and {len(self.unregistered)} unregistered images "
+                f"do not make {self.num_images}"
+            )
+
+    @property
+    def metric(self) -> bool:
+        """Every model is in metres."""
+        return all(model.metric for model in self.models)
+
+    @property
+    def scale_statement(self) -> str:
+        """What one unit of length is."""
+        return "metres" if self.metric else "arbitrary (one unit has no length in metres)"
+
+    @property
+    def weak_reasons(self) -> tuple[str, ...]:
+        """Why the result falls short; empty when it does not."""
+        reasons = []
+        if self.rejected:
+            files = self.num_images + len(self.rejected)
+            reasons.append(f"{len(self.rejected)} of {files} files could not be used")
+        if self.unregistered:
+            reasons.append(f"{len(self.unregistered)} of {self.num_images} images got no pose")
+        if len(self.models) > 1:
+            reasons.append(
+                f"the images fall into {len(self.models)} models that could not be connected; "
+                f"the largest has {self.models[0].num_images} of {self.num_images} images"
+            )
+        empty = [str(segment.index) for segment in self.segments if not segment.num_pieces]
+        if empty:
+            reasons.append(f"nothing came out of segment {', '.join(empty)}")
+        return tuple(reasons)
+
+    @property
+    def exit_code(self) -> int:
+        """For the shell: good, or finished but weak."""
+        return EXIT_WEAK if self.weak_reasons else EXIT_GOOD
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """For ``summary.json``: numbers, strings, lists and null only; NaN becomes null.
+
+        The output folder is left out, because the file lies in it and the folder may move.
+        """
+        facts = asdict(self)
+        del facts["output"]
+        facts["scale"] = self.scale_statement
+        facts["weak_reasons"] = list(self.weak_reasons)
+        plain = _without_nan(facts)
+        assert isinstance(plain, dict)
+        return plain
+
+    def render_text(self) -> str:
+        """Several lines for people, ending without a line break."""
+        lines = [f"{self.num_registered} of {self.num_images} images have a pose. Scale: {self.scale_statement}."]
+        lines += [f"  {_model_line(model)}" for model in self.models]
+        lines += _remark_lines("without a pose", self.unregistered)
+        lines += _remark_lines("left out", self.rejected)
+        lines += [f"weak: {reason}" for reason in self.weak_reasons]
+        lines.append(self._cost_line())
+        lines.append(f"Result in {self.output}")
+        return "\n".join(lines)
+
+    def _cost_line(self) -> str:
+        wall_s = sum(stage.wall_s for stage in self.stages)
+        cpu_s = sum(stage.cpu_s for stage in self.stages)
+        reused = [stage.name for stage in self.stages if stage.reused]
+        line = f"Took {format_seconds(wall_s)} (processor time {format_seconds(cpu_s)}), "
+        line += f"at most {self.peak_memory_bytes / 2**30:.1f} GiB of memory per process"
+        return f"{line}; reused from an earlier run: {', '.join(reused)}" if reused else line
+
+
+def _model_line(model: ModelSummary) -> str:
+    segments = f"segments {', '.join(model.segments)}" if len(model.segments) > 1 else "one segment"
+    return f"{model.folder}: {model.num_images} images, {model.num_points} points, {segments}"
+
+
+def _remark_lines(what: str, remarks: tuple[ImageRemark, ...]) -> list[str]:
+    lines = [f"  {what}: {remark.name} ({remark.reason})" for remark in remarks[:_NAMES_SHOWN]]
+    if len(remarks) > _NAMES_SHOWN:
+        lines.append(f"  {what}: {len(remarks) - _NAMES_SHOWN} more, see summary.json")
+    return lines
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_nan(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,107 @@
+"""The settings, as values and as a TOML file."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from smust3r_colmap.config import AlignmentConfig, ImportConfig, OutputConfig, RunConfig, SegmentationConfig
+from smust3r_colmap.config_file import config_from_toml, config_to_toml, flags_from_settings, read_settings
+from smust3r_colmap.errors import ConfigError
+
+# Every group and every type of value differs from its default.
+ODD_CONFIG = RunConfig(
+    importing=ImportConfig(camera_mode="per-folder", camera_model='a "quoted" \\ name, ü'),
+    segmentation=SegmentationConfig(segment_length=7, overlap=3),
+    alignment=AlignmentConfig(huber_delta=1e-7, robust_kernel="huber"),
+    output=OutputConfig(text=True),
+    workers=3,
+    seed=11,
+)
+
+
+def _toml(folder: Path, text: str) -> Path:
+    path = folder / "settings.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("config", [RunConfig(), ODD_CONFIG])
+def test_settings_survive_the_way_through_toml(tmp_path: Path, config: RunConfig) -> None:
+    assert config_from_toml(_toml(tmp_path, config_to_toml(config))) == config
+
+
+def test_keys_that_are_left_out_keep_their_default(tmp_path: Path) -> None:
+    config = config_from_toml(_toml(tmp_path, "overlap = 10\ntext = true\n"))
+
+    assert config == replace(RunConfig(), segmentation=SegmentationConfig(overlap=10), output=OutputConfig(text=True))
+
+
+def test_whole_numbers_are_taken_for_real_ones(tmp_path: Path) -> None:
+    value = config_from_toml(_toml(tmp_path, "min_confidence = 3")).fusion.min_confidence
+
+    assert isinstance(value, float)
+    assert value == 3.0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("segment_lenght = 5", "unknown setting 'segment_lenght'; known are segment_length"),
+        ("zzzz = 5", "unknown setting 'zzzz'; known are .*overlap.*seed"),
+        ("[segmentation]\noverlap = 5", "segmentation. is a table"),
+        ("overlap = 1.5", "overlap = 1.5 is a float; needed is a int"),
+        ("overlap = true", "overlap = True is a bool; needed is a int"),
+        ("min_confidence = true", "is a bool; needed is a float"),
+        ("text = 1", "text = 1 is a int; needed is a bool"),
+        ("camera_model = 1", "needed is a str"),
+        ("camera_mode = 'sinlge'", "'sinlge'; choose one of 'auto', 'single'"),
+        ("camera_mode = ['auto']", "choose one of"),
+        ("overlap = 60", "--overlap 60 must be smaller than --segment-length 60"),
+        ("overlap =", "not TOML"),
+    ],
+)
+def test_bad_files_are_refused_by_name_and_key(tmp_path: Path, text: str, message: str) -> None:
+    path = _toml(tmp_path, text)
+
+    with pytest.raises(ConfigError, match=message) as refusal:
+        config_from_toml(path)
+    assert str(refusal.value).startswith(str(path))
+
+
+def test_files_that_are_not_there_or_not_text_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot read the settings"):
+        read_settings(tmp_path / "absent.toml")
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="not TOML"):
+        read_settings(tmp_path / "binary.toml")
+
+
+def test_settings_become_flags() -> None:
+    flags = flags_from_settings({"segment_length": 5, "text": True, "camera_model": "-x"})
+
+    assert flags == ["--segment-length=5", "--text", "--camera-model=-x"]
+    assert flags_from_settings({"text": False}) == ["--no-text"]
+
+
+@pytest.mark.parametrize(
+    ("length", "overlap", "message"),
+    [
+        (1, 1, "a segment needs at least 2 images"),
+        (5, 0, "must share at least 1 image"),
+        (5, 5, "--overlap 5 must be smaller than --segment-length 5"),
+        (5, 9, "--overlap 9 must be smaller than --segment-length 5"),
+    ],
+)
+def test_windows_that_cannot_chain_are_refused(length: int, overlap: int, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        SegmentationConfig(segment_length=length, overlap=overlap)
+
+
+def test_tightest_windows_are_accepted() -> None:
+    assert SegmentationConfig(segment_length=2, overlap=1).overlap == 1
+
+
+def test_negative_workers_are_refused() -> None:
+    with pytest.raises(ConfigError, match="--workers -1"):
+        RunConfig(workers=-1)
