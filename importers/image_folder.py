@@ -292,15 +292,16 @@ class _Usable:
 
 
 def collection_from_scan(scan: FolderScan, config: ImportConfig) -> ImageCollection:
-    """Leave out duplicates and share cameras.
+    """Leave out what cannot be used and share cameras.
 
-    Of files with the same content, or the same name but for the way accents are composed, the first is kept.
+    Of names that differ only in the way accents are composed, the first is kept. Files with the same content
+    are kept, as the repeated frames of a video, each to get a pose; but they count as one towards the minimum.
 
     Raises:
         ConfigError, CollectionError: as ``import_image_folder``.
     """
     _check_camera_model(config.camera_model)
-    usable, left_out = _without_duplicates(scan.records)
+    usable, left_out = _without_name_twins(scan.records)
     rejected = sorted([*left_out, *scan.unreadable], key=lambda image: natural_key(image.name))
     _check_enough(scan, usable, rejected)
     groups = _camera_groups(usable, config.camera_mode)
@@ -321,21 +322,18 @@ def collection_from_scan(scan: FolderScan, config: ImportConfig) -> ImageCollect
     return ImageCollection(images=images, cameras=tuple(cameras), rejected=tuple(rejected))
 
 
-def _without_duplicates(records: Sequence[ImportRecord]) -> tuple[list[_Usable], list[RejectedImage]]:
+def _without_name_twins(records: Sequence[ImportRecord]) -> tuple[list[_Usable], list[RejectedImage]]:
     usable: list[_Usable] = []
     left_out: list[RejectedImage] = []
-    by_digest: dict[str, str] = {}
     by_composed_name: dict[str, str] = {}
     for record in records:
         composed = unicodedata.normalize("NFC", record.name)
         if record.photo is None:
             reason = record.reason
-        elif record.digest in by_digest:
-            reason = f"same content as {by_digest[record.digest]}"
         elif composed in by_composed_name:
             reason = f"same name as {by_composed_name[composed]!a} but for the composition of accents; rename it"
         else:
-            by_digest[record.digest] = by_composed_name[composed] = record.name
+            by_composed_name[composed] = record.name
             usable.append(_Usable(name=record.name, digest=record.digest, photo=record.photo))
             continue
         left_out.append(RejectedImage(name=record.name, reason=reason))
@@ -343,9 +341,13 @@ def _without_duplicates(records: Sequence[ImportRecord]) -> tuple[list[_Usable],
 
 
 def _check_enough(scan: FolderScan, usable: Sequence[_Usable], rejected: Sequence[RejectedImage]) -> None:
-    if len(usable) >= MIN_IMAGES:
+    distinct = {image.digest for image in usable}
+    if len(distinct) >= MIN_IMAGES:
         return
-    found = f"1 usable image ({usable[0].name})" if usable else "no usable image"
+    if len(usable) >= MIN_IMAGES:
+        found = f"{len(usable)} images of the same content ({usable[0].name}, {usable[1].name}, ...)"
+    else:
+        found = f"1 usable image ({usable[0].name})" if usable else "no usable image"
     message = f"{scan.folder}: {found}, at least {MIN_IMAGES} are needed; read are {' '.join(SUFFIXES)}"
     if rejected:
         message += f"; left out {len(rejected)}: " + "; ".join(f"{one.name}: {one.reason}" for one in rejected[:5])

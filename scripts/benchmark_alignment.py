@@ -116,11 +116,13 @@ class MapsInMemory:
 
     def pointmap_seg(self, k: int) -> npt.NDArray[np.float32]:
         """(H, W, 3) points."""
-        return self.points_seg[k]
+        pointmap: npt.NDArray[np.float32] = self.points_seg[k]
+        return pointmap
 
     def depth(self, k: int) -> npt.NDArray[np.float32]:
         """(H, W) z-depth."""
-        return self.depth_seg[k]
+        depth: npt.NDArray[np.float32] = self.depth_seg[k]
+        return depth
 
     def confidence(self, k: int) -> npt.NDArray[np.float32]:
         """(H, W), the same everywhere: nothing gives the outliers away."""

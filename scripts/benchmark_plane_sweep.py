@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -172,12 +171,8 @@ def report(samples: FloatArray, pixels: FloatArray, within: float) -> None:
         coverage = ((pixels[:, 0] > 0) & (pixels[:, 2] >= cut)).mean()
         if len(kept):
             error = np.abs(kept[:, 0] / kept[:, 1] - 1.0)
-            print(
-                f"{cut:>10} {coverage:>9.1%} {np.median(error):>8.2%} {error.mean():>8.2%} {(error < within).mean():>10.1%}"
-            )
-
-
-Judge = Callable[[Stretch, list[ImageDepth]], tuple[FloatArray, FloatArray]]
+            share = (error < within).mean()
+            print(f"{cut:>10} {coverage:>9.1%} {np.median(error):>8.2%} {error.mean():>8.2%} {share:>10.1%}")
 
 
 def main() -> None:

@@ -14,7 +14,8 @@ import json
 import logging
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -157,13 +158,18 @@ def _run(command: Command) -> int:
 def _run_reconstruct(command: Reconstruct) -> int:
     from smust3r_colmap.pipeline import reconstruct  # noqa: PLC0415  (heavy: --help shall not pay for it)
 
-    reporter = _start_reporting(quiet=command.quiet, verbose=command.verbose)
-    summary = reconstruct(command.images, command.output, command.settings, fresh=command.fresh, reporter=reporter)
-    _tell(summary, reporter, quiet=command.quiet)
-    return summary.exit_code
+    with _reporting(quiet=command.quiet, verbose=command.verbose) as reporter:
+        summary = reconstruct(command.images, command.output, command.settings, fresh=command.fresh, reporter=reporter)
+        _tell(summary, reporter, quiet=command.quiet)
+        return summary.exit_code
 
 
 def _run_demo(command: Demo) -> int:
+    with _reporting(quiet=command.quiet, verbose=command.verbose) as reporter:
+        return _demo(command, reporter)
+
+
+def _demo(command: Demo, reporter: Reporter) -> int:
     from smust3r_colmap.demo import write_demo  # noqa: PLC0415  (heavy: --help shall not pay for it)
     from smust3r_colmap.evaluation import (  # noqa: PLC0415
         compare_trajectories,
@@ -172,12 +178,12 @@ def _run_demo(command: Demo) -> int:
     )
     from smust3r_colmap.pipeline import reconstruct  # noqa: PLC0415
 
-    reporter = _start_reporting(quiet=command.quiet, verbose=command.verbose)
     truth_file, images, result = (command.output / name for name in ("poses.txt", "images", "result"))
     if images.exists() and not truth_file.exists():
         raise InputError(f"{command.output}: has images that are no demo; name another folder with --output")
-    reporter.note(f"rendering {command.num_images} images into {images}")
-    write_demo(command.output, num_images=command.num_images)
+    if not truth_file.exists() or len(read_poses_txt(truth_file)) != command.num_images:
+        reporter.note(f"rendering {command.num_images} images into {images}")
+        write_demo(command.output, num_images=command.num_images)
     truth = read_poses_txt(truth_file)
     others = {path.name for path in images.iterdir()} - truth.keys()
     if others:
@@ -211,14 +217,20 @@ def _run_doctor(command: Doctor) -> int:
     return EXIT_GOOD if diagnosis.healthy else EXIT_FAILED
 
 
-def _start_reporting(*, quiet: bool, verbose: bool) -> Reporter:
+@contextmanager
+def _reporting(*, quiet: bool, verbose: bool) -> Iterator[Reporter]:
     """Progress and log messages go to standard error; results alone go to standard output."""
     reporter = reporter_for(sys.stderr, quiet=quiet)
+    handler = _ReporterHandler(reporter)
     package_logger = logging.getLogger("smust3r_colmap")
-    package_logger.handlers = [_ReporterHandler(reporter)]
+    package_logger.addHandler(handler)
     package_logger.setLevel(logging.DEBUG if verbose else logging.WARNING)
     package_logger.propagate = False
-    return reporter
+    try:
+        yield reporter
+    finally:
+        package_logger.removeHandler(handler)
+        package_logger.propagate = True
 
 
 class _ReporterHandler(logging.Handler):

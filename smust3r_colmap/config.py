@@ -45,9 +45,7 @@ class SegmentationConfig:
         if self.overlap < 1:
             raise ConfigError(f"--overlap {self.overlap}: neighbouring segments must share at least 1 image")
         if self.overlap >= self.segment_length:
-            raise ConfigError(
-                f"--overlap {self.overlap} must be smaller than --segment-length {self.segment_length}"
-            )
+            raise ConfigError(f"--overlap {self.overlap} must be smaller than --segment-length {self.segment_length}")
 
 
 @dataclass(frozen=True, kw_only=True)

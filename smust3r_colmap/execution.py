@@ -111,7 +111,8 @@ def _run_until_broken(
                 waiting.popleft()
             done, _ = wait(in_flight, return_when=FIRST_COMPLETED)
             for future in done:
-                yield TaskResult(index=in_flight.pop(future), value=future.result())
+                value = future.result()
+                yield TaskResult(index=in_flight.pop(future), value=value)
     except BrokenProcessPool:
         suspects = sorted(in_flight.values())
         logger.warning("a child process died; running %d tasks again one by one", len(suspects))

@@ -167,6 +167,11 @@ class FeatureLinks:
     image_b: IntArray
     feature_b: IntArray
 
+    def __post_init__(self) -> None:
+        shapes = {self.image_a.shape, self.feature_a.shape, self.image_b.shape, self.feature_b.shape}
+        if len(shapes) != 1 or self.image_a.ndim != 1:
+            raise ValueError(f"FeatureLinks: arrays of shapes {sorted(shapes)}, needed (M,) each")
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SegmentPiece:
@@ -249,7 +254,7 @@ class Sim3Estimate:
         num_points: correspondences of positive weight that were offered.
         num_inliers: those within three robust standard deviations.
         rms: of the inlier residuals, in units of b (or relative, where the caller normalised).
-        residual_sigma: robust standard deviation of all residuals (1.4826 MAD).
+        residual_sigma: robust standard deviation, 1.4826 times the median of the residuals within three of it.
         iterations: of the reweighting.
         stop_reason: ``"converged"`` or ``"iteration limit"``.
         information: (7, 7) inverse covariance of the right perturbation

@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.alignment.from_pointmaps import align_pointmaps
 from smust3r_colmap.alignment.from_tracks import align_tracks, match_links, point_depths
-from smust3r_colmap.alignment.irls import align_seen_points, consensus_sim3, estimate_sim3
+from smust3r_colmap.alignment.irls import PieceFit, align_seen_points, consensus_sim3, estimate_sim3
 from smust3r_colmap.config import AlignmentConfig, RobustKernel
 from smust3r_colmap.errors import DegenerateAlignmentError, ReconstructionError
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import Sim3
-from smust3r_colmap.products import SegmentPiece, Tracks
+from smust3r_colmap.products import FeatureLinks, SegmentPiece, Tracks
 
 FloatArray = npt.NDArray[np.float64]
 KERNELS: tuple[RobustKernel, ...] = get_args(RobustKernel)
@@ -215,8 +215,8 @@ def test_fixed_scale_keeps_one_and_finds_the_rigid_motion() -> None:
 def test_rows_without_weight_or_value_have_no_influence() -> None:
     data = room_overlap(400, 0.0)
     clean = estimate_sim3(data.points_source, data.points_target, data.ones)
-    points = np.vstack([data.points_source, [[np.nan, 0, 0], [1, 2, 3], [9, 9, 9]]])
-    targets = np.vstack([data.points_target, [[0, 0, 0], [np.inf, 0, 0], [-90, 9, 9]]])
+    points = np.vstack([data.points_source, np.array([[np.nan, 0, 0], [1, 2, 3], [9, 9, 9]])])
+    targets = np.vstack([data.points_target, np.array([[0, 0, 0], [np.inf, 0, 0], [-90, 9, 9]])])
     scale = np.append(data.ones, [1.0, 1.0, 1.0])
     dirty = estimate_sim3(points, targets, np.append(data.ones, [1.0, 1.0, 0.0]), residual_scale=scale)
     assert_close(dirty.b_from_a, clean.b_from_a, 1e-12)
@@ -385,13 +385,16 @@ class Maps:
         return len(self.depths)
 
     def pointmap_seg(self, k: int) -> npt.NDArray[np.float32]:
-        return self.points[k]
+        pointmap: npt.NDArray[np.float32] = self.points[k]
+        return pointmap
 
     def depth(self, k: int) -> npt.NDArray[np.float32]:
-        return self.depths[k]
+        depth: npt.NDArray[np.float32] = self.depths[k]
+        return depth
 
     def confidence(self, k: int) -> npt.NDArray[np.float32]:
-        return self.confidences[k]
+        confidence: npt.NDArray[np.float32] = self.confidences[k]
+        return confidence
 
     def rgb(self, k: int) -> npt.NDArray[np.uint8]:
         return np.zeros(self.points[k].shape, dtype=np.uint8)
@@ -617,17 +620,31 @@ def test_pieces_without_usable_tracks_are_refused() -> None:
 
 
 # ---------------------------------------------------------------------------------- links
-def links_between(wrong: float, *, seed: int = 0) -> dict[str, npt.NDArray[np.int64]]:
+def links_between(wrong: float, *, seed: int = 0) -> FeatureLinks:
     """Matches of image 1 of one piece with image 5 of the other; the wrong ones name any feature."""
     rng = np.random.default_rng(seed)
     point = np.arange(NUM_POINTS)
     other = np.where(rng.random(NUM_POINTS) < wrong, rng.integers(0, NUM_POINTS, NUM_POINTS), point)
-    return {
-        "image_a": np.full(NUM_POINTS, 1),
-        "feature_a": (point * 7 + 1) % NUM_POINTS,
-        "image_b": np.full(NUM_POINTS, 5),
-        "feature_b": (other * 7 + 5) % NUM_POINTS,
-    }
+    return FeatureLinks(
+        image_a=np.full(NUM_POINTS, 1),
+        feature_a=(point * 7 + 1) % NUM_POINTS,
+        image_b=np.full(NUM_POINTS, 5),
+        feature_b=(other * 7 + 5) % NUM_POINTS,
+    )
+
+
+def fit_to_links(
+    target: SegmentPiece, source: SegmentPiece, links: FeatureLinks, settings: AlignmentConfig
+) -> PieceFit:
+    return match_links(
+        target,
+        source,
+        settings,
+        image_a=links.image_a,
+        feature_a=links.feature_a,
+        image_b=links.image_b,
+        feature_b=links.feature_b,
+    )
 
 
 @pytest.mark.parametrize("kernel", REDESCENDING)
@@ -636,7 +653,7 @@ def test_match_links_survive_wrong_links(kernel: RobustKernel, wrong: float) -> 
     target = track_piece((0, 1, 2), Sim3.identity(), segment=0, noise=0.005)
     source = track_piece((4, 5, 6), SOURCE_FROM_TARGET, segment=1, noise=0.005)
     settings = AlignmentConfig(robust_kernel=kernel)
-    fit = match_links(target, source, settings, **links_between(wrong))
+    fit = fit_to_links(target, source, links_between(wrong), settings)
     assert float(fit.estimate.b_from_a.scale) == pytest.approx(1 / 1.7, rel=4e-3)
     np.testing.assert_allclose(fit.estimate.b_from_a.rotation, TARGET_FROM_SOURCE.rotation, atol=5e-3)
     assert fit.num_correspondences == NUM_POINTS
@@ -647,7 +664,7 @@ def test_match_links_survive_wrong_links(kernel: RobustKernel, wrong: float) -> 
 def test_match_links_without_noise_or_wrong_links_are_exact() -> None:
     target = track_piece((0, 1, 2), Sim3.identity(), segment=0)
     source = track_piece((4, 5, 6), SOURCE_FROM_TARGET, segment=1)
-    fit = match_links(target, source, AlignmentConfig(), **links_between(0.0))
+    fit = fit_to_links(target, source, links_between(0.0), AlignmentConfig())
     assert_close(fit.estimate.b_from_a, TARGET_FROM_SOURCE, 1e-9)
 
 
@@ -655,17 +672,16 @@ def test_links_to_no_point_are_passed_over() -> None:
     target = track_piece((0, 1, 2), Sim3.identity(), segment=0)
     source = track_piece((4, 5, 6), SOURCE_FROM_TARGET, segment=1)
     links = links_between(0.0)
-    links["feature_a"][:50] += 10_000
-    links["image_b"][50:70] = 77
-    assert match_links(target, source, AlignmentConfig(), **links).num_correspondences == NUM_POINTS - 70
-    links["image_b"][:] = 77
+    links.feature_a[:50] += 10_000
+    links.image_b[50:70] = 77
+    assert fit_to_links(target, source, links, AlignmentConfig()).num_correspondences == NUM_POINTS - 70
+    links.image_b[:] = 77
     with pytest.raises(DegenerateAlignmentError, match="pieces 0 and 1, points linked by matches: 0 point pairs"):
-        match_links(target, source, AlignmentConfig(), **links)
+        fit_to_links(target, source, links, AlignmentConfig())
 
 
 def test_links_of_different_length_are_refused() -> None:
     target = track_piece((0, 1), Sim3.identity(), segment=0)
-    links = links_between(0.0)
-    links["image_b"] = links["image_b"][:-1]
+    row = np.zeros(5, dtype=np.int64)
     with pytest.raises(ValueError, match=r"needed \(M,\) each"):
-        match_links(target, target, AlignmentConfig(), **links)
+        match_links(target, target, AlignmentConfig(), image_a=row, feature_a=row, image_b=row[:-1], feature_b=row)

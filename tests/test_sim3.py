@@ -92,7 +92,8 @@ def test_moved_cameras_keep_orthonormal_axes_and_every_projection() -> None:
 def seen_by(frame_from_cam: FloatArray, points: FloatArray) -> FloatArray:
     """(N, P, 3) points in each camera."""
     cam_from_frame = invert_rigid(frame_from_cam)
-    return np.einsum("nij,pj->npi", cam_from_frame[:, :, :3], points) + cam_from_frame[:, None, :, 3]
+    seen: FloatArray = np.einsum("nij,pj->npi", cam_from_frame[:, :, :3], points) + cam_from_frame[:, None, :, 3]
+    return seen
 
 
 def test_batched_cameras_move_like_single_ones() -> None:

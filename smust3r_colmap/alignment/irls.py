@@ -404,7 +404,7 @@ def align_seen_points(
     """Robust ``target_from_source`` of points that cameras saw at known depths.
 
     ``cauchy`` and ``tukey`` divide the residual by the depth, since the error of a point grows with
-    it, and start from a consensus: from the plain start they are lost from 40 % one-sided wrong pairs
+    it, and start from a consensus: from the plain start they are lost from 40 % coherent wrong pairs
     on. The depth is the geometric mean of both sides, for the depth of one side gives more weight to
     points which that side has too near, and a bias to the scale. ``huber`` is the method of the
     paper: plain residuals, plain start.

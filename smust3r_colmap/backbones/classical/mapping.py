@@ -13,6 +13,7 @@ import logging
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,10 @@ MIN_JUMP_DEPTHS = 0.5
 """... unless the step is small beside the distance of what they see, as after a pause."""
 MIN_PAIR_INLIERS = 15
 """Verified matches below which COLMAP does not use a pair."""
+MIN_EXPLAINED_SHARE = 0.5
+"""A relative pose that fewer of the pair's verified matches agree with is a fold."""
+MAX_EPIPOLAR_ERROR_PX = 4.0
+"""COLMAP's own bound for an inlier of two views."""
 STRONG_PAIR_INLIERS = 30
 """Verified matches that make two images certain neighbours (COLMAP's own bar for registration)."""
 NEAR_OFFSET = 4
@@ -166,14 +171,22 @@ class _Ladder:
 
     # ------------------------------------------------------------------- attempts
     def _attempt(self, name: str, models: dict[int, pycolmap.Reconstruction]) -> None:
-        """Record an attempt. A fold is tried again: from another start, with near pairs, then cut."""
+        """Record an attempt. Jumps ask for a second opinion; those that the matches deny are cut."""
         found = self._convert(models, name)
-        if any(self._jumps(model) for model in found):
-            self.attempts.append(f"{name}: {self._describe_jump(found)}; once more from a relaxed start")
+        if self._count_jumps(found):
             self.largest_output = None
-            found = self._convert(self._incremental("segment.db", relaxed=True), f"{name}, relaxed after a jump")
-        if any(self._jumps(model) for model in found):
-            self.attempts.append(f"{name}: {self._describe_jump(found)}; once more with near pairs only, then cut")
+            second = self._convert(self._incremental("segment.db", relaxed=True), f"{name}, second opinion")
+            better = bool(second) and self._count_jumps(second) < self._count_jumps(found)
+            self.attempts.append(
+                f"{name}: {self._count_jumps(found)} jumps between neighbours that match, "
+                f"{self._count_jumps(second)} from a relaxed start; {'the second' if better else 'the first'} is kept"
+            )
+            found = second if better else found
+        folds = sum(len(self._folds(model)) for model in found)
+        if folds:
+            self.attempts.append(
+                f"{name}: {folds} jumps that the matches deny; once more with near pairs only, then cut"
+            )
             near = tuple(pair for pair in self.task.pairs if self._offset(pair) <= NEAR_OFFSET)
             self._build_database("near.db", near)
             again = self._convert(self._incremental("near.db", relaxed=True), f"{name}, near pairs")
@@ -189,11 +202,6 @@ class _Ladder:
         self.attempts.append(f"{name}: {sizes} of {len(self.task.images)} images")
         if accepted:
             self.candidates.append(tuple(accepted))
-
-    def _describe_jump(self, models: Sequence[MappedModel]) -> str:
-        jumps = [(model.images[k], model.images[k + 1]) for model in models for k in self._jumps(model)]
-        first, second = jumps[0]
-        return f"{len(jumps)} jumps between neighbours that match, the first from image {first} to {second}"
 
     def _enough(self) -> bool:
         most = max((len(models[0].images) for models in self.candidates), default=0)
@@ -261,14 +269,33 @@ class _Ladder:
                 return f"focal length {intrinsics.focal_px:.0f} px, the run's is {trusted:.0f} px"
         return ""
 
-    def _jumps(self, model: MappedModel) -> list[int]:
-        """Positions k such that image k and the next one match strongly but stand apart in the model."""
-        return find_jumps(model, self.task.images, self.inliers)
+    def _count_jumps(self, models: Sequence[MappedModel]) -> int:
+        return sum(len(find_jumps(model, self.task.images, self.inliers)) for model in models)
+
+    def _folds(self, model: MappedModel) -> list[int]:
+        """Jumps that the matches of the two images deny: the model laid one place onto another.
+
+        A drone that turns at the end of a strip jumps too, but there the matches agree.
+        """
+        return [
+            k
+            for k in find_jumps(model, self.task.images, self.inliers)
+            if self._explained_share(model, k) < MIN_EXPLAINED_SHARE
+        ]
+
+    def _explained_share(self, model: MappedModel, k: int) -> float:
+        """Share of the verified matches of image k and the next that fit the model's relative pose."""
+        first, second = model.images[k], model.images[k + 1]
+        with pycolmap.Database.open(self.task.database) as database:
+            matches = database.read_two_view_geometry(first + 1, second + 1).inlier_matches
+            xy_img = [np.asarray(database.read_keypoints(i + 1), dtype=np.float64)[:, :2] for i in (first, second)]
+        errors_px = epipolar_errors_px(model, k, xy_img[0][matches[:, 0]], xy_img[1][matches[:, 1]])
+        return float(np.mean(errors_px < MAX_EPIPOLAR_ERROR_PX))
 
     def _cut(self, model: MappedModel) -> list[MappedModel]:
-        """The model without jumps: its parts between them, those that are large enough."""
-        bounds = [0, *[k + 1 for k in self._jumps(model)], len(model.images)]
-        parts = [range(a, b) for a, b in zip(bounds, bounds[1:], strict=False) if b - a >= self.min_images]
+        """The model without folds: its parts between them, those that are large enough."""
+        bounds = [0, *[k + 1 for k in self._folds(model)], len(model.images)]
+        parts = [range(a, b) for a, b in pairwise(bounds) if b - a >= self.min_images]
         return [restrict_model(model, part) for part in parts]
 
     # ------------------------------------------------------------------- plumbing
@@ -310,7 +337,7 @@ def find_jumps(model: MappedModel, order: Sequence[int], inliers: Mapping[Pair, 
     """
     place = {image: k for k, image in enumerate(order)}
     steps = []
-    for k, (first, second) in enumerate(zip(model.images, model.images[1:], strict=False)):
+    for k, (first, second) in enumerate(pairwise(model.images)):
         if place[second] - place[first] == 1 and inliers.get((first, second), 0) >= STRONG_PAIR_INLIERS:
             steps.append(k)
     if not steps:
@@ -326,6 +353,21 @@ def find_jumps(model: MappedModel, order: Sequence[int], inliers: Mapping[Pair, 
         if turn_deg > MAX_TURN_DEG or far:
             jumps.append(k)
     return jumps
+
+
+def epipolar_errors_px(
+    model: MappedModel, k: int, xy_first: npt.NDArray[np.float64], xy_second: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """(M,) Sampson errors of points of image ``k`` and the next under the model's relative pose, in pixels."""
+    second_from_first = pycolmap.Rigid3d(model.seg_from_cam[k + 1]).inverse() * pycolmap.Rigid3d(model.seg_from_cam[k])
+    squared = pycolmap.compute_squared_sampson_error(
+        model.intrinsics[k].rays_cam(xy_first)[:, :2],
+        model.intrinsics[k + 1].rays_cam(xy_second)[:, :2],
+        pycolmap.essential_matrix_from_pose(second_from_first),
+    )
+    focal_px = 0.5 * (model.intrinsics[k].focal_px + model.intrinsics[k + 1].focal_px)
+    errors: npt.NDArray[np.float64] = focal_px * np.sqrt(squared)
+    return errors
 
 
 def _median_depth(model: MappedModel, k: int) -> float:

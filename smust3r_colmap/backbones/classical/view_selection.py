@@ -28,7 +28,7 @@ _SPREAD_BELOW, _SPREAD_ABOVE = 0.5, 0.8
 _SAME_SIDE_PENALTY = 0.6
 """Share of its score that a neighbour loses when it lies in exactly the direction of a chosen one: what
 is hidden on one side of the reference is often seen from the other."""
-_MAX_POINTS = 400
+_MAX_POINTS = 200
 """Points per reference that vote; more do not change the choice."""
 _NEAR_MARGIN, _FAR_MARGIN = 0.8, 1.25
 """Surfaces without features reach beyond the sparse points."""
@@ -66,13 +66,14 @@ class PinholeCamera:
             img_from_cam=scale @ self.img_from_cam, cam_from_seg=self.cam_from_seg, width=width, height=height
         )
 
-    def depth_in_view(self, points_seg: FloatArray) -> FloatArray:
-        """(P,) z-depth of points (P, 3); NaN where a point is behind the camera or outside its image."""
-        points_img = (points_seg @ self.cam_from_seg[:, :3].T + self.cam_from_seg[:, 3]) @ self.img_from_cam.T
-        z = points_img[:, 2]
-        in_view = (z > 0) & (points_img[:, :2] >= 0).all(axis=1)
-        in_view &= (points_img[:, 0] < self.width * z) & (points_img[:, 1] < self.height * z)
-        return np.where(in_view, z, np.nan)
+
+def depths_in_views(cameras: Sequence[PinholeCamera], points_seg: FloatArray) -> FloatArray:
+    """(N, P) z-depth of points (P, 3) in N views; NaN where a point is behind a camera or outside its image."""
+    img_from_seg = np.stack([camera.img_from_cam @ camera.cam_from_seg for camera in cameras])
+    x, y, z = np.moveaxis(img_from_seg[:, :, :3] @ points_seg.T + img_from_seg[:, :, 3:], 1, 0)
+    width, height = (np.array([getattr(c, side) for c in cameras])[:, None] for side in ("width", "height"))
+    in_view = (z > 0) & (x >= 0) & (y >= 0) & (x < width * z) & (y < height * z)
+    return np.where(in_view, z, np.nan)
 
 
 def choose_neighbours(
@@ -92,19 +93,15 @@ def choose_neighbours(
     if len(points_seg) == 0:
         return ()
     points = points_seg[:: max(1, len(points_seg) // _MAX_POINTS)]
-    centre = cameras[reference].centre_seg
-    scores = np.zeros(len(cameras))
-    directions = np.zeros((len(cameras), 3))
-    for j, camera in enumerate(cameras):
-        in_view = np.isfinite(camera.depth_in_view(points))
-        if j == reference or in_view.mean() < MIN_OVERLAP:
-            continue
-        parallax_deg = _parallax_deg(points[in_view], centre, camera.centre_seg)
-        if np.median(parallax_deg) < MIN_PARALLAX_DEG:
-            continue
-        scores[j] = _parallax_weight(parallax_deg).sum() / len(points)
-        baseline = camera.centre_seg - centre
-        directions[j] = baseline / np.linalg.norm(baseline)
+    in_view = np.isfinite(depths_in_views(cameras, points))
+    centres = np.stack([camera.centre_seg for camera in cameras])
+    parallax_deg = _parallax_deg(points, centres[reference], centres)
+    usable = in_view.mean(axis=1) >= MIN_OVERLAP
+    usable &= (in_view & (parallax_deg >= MIN_PARALLAX_DEG)).sum(axis=1) > 0.5 * in_view.sum(axis=1)
+    usable[reference] = False
+    scores = np.where(usable, (_parallax_weight(parallax_deg) * in_view).mean(axis=1), 0.0)
+    baselines = centres - centres[reference]
+    directions = baselines / np.maximum(np.linalg.norm(baselines, axis=1, keepdims=True), 1e-12)
     chosen: list[int] = []
     while len(chosen) < count and scores.max() > 0:
         best = int(scores.argmax())
@@ -120,7 +117,7 @@ def inverse_depth_range(camera: PinholeCamera, points_seg: FloatArray) -> tuple[
 
     The extreme percents are dropped first: a few sparse points are always wrong.
     """
-    depths = camera.depth_in_view(points_seg)
+    depths = depths_in_views([camera], points_seg)
     depths = depths[np.isfinite(depths)]
     if len(depths) == 0:
         return None
@@ -128,16 +125,17 @@ def inverse_depth_range(camera: PinholeCamera, points_seg: FloatArray) -> tuple[
     return float(1.0 / (far * _FAR_MARGIN)), float(1.0 / (near * _NEAR_MARGIN))
 
 
-def _parallax_deg(points_seg: FloatArray, centre_a: FloatArray, centre_b: FloatArray) -> FloatArray:
-    """(P,) angle at each point between the rays to two centres, in degrees."""
-    rays_a, rays_b = points_seg - centre_a, points_seg - centre_b
-    sines = np.linalg.norm(np.cross(rays_a, rays_b), axis=1)
-    angles: FloatArray = np.degrees(np.arctan2(sines, (rays_a * rays_b).sum(axis=1)))
+def _parallax_deg(points_seg: FloatArray, centre: FloatArray, others: FloatArray) -> FloatArray:
+    """(N, P) angle at each of P points between the rays to one centre and to N others, in degrees."""
+    to_centre, to_others = centre - points_seg, others[:, None] - points_seg
+    lengths = np.linalg.norm(to_centre, axis=-1) * np.linalg.norm(to_others, axis=-1)
+    cosines = (to_centre * to_others).sum(axis=-1) / np.maximum(lengths, 1e-300)
+    angles: FloatArray = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
     return angles
 
 
 def _parallax_weight(parallax_deg: FloatArray) -> FloatArray:
-    """(P,) in (0, 1], 1 at the best parallax."""
+    """In (0, 1], 1 at the best parallax; any shape."""
     log_ratio = np.log(np.maximum(parallax_deg, 1e-3) / BEST_PARALLAX_DEG)
     spread = np.where(log_ratio < 0, _SPREAD_BELOW, _SPREAD_ABOVE)
     weight: FloatArray = np.exp(-0.5 * (log_ratio / spread) ** 2)

@@ -1,0 +1,65 @@
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from smust3r_colmap.errors import StorageError
+from smust3r_colmap.execution import TaskFailure, map_tasks
+
+
+def square_unless_told_otherwise(task: int | str) -> int:
+    if task == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if task == "raise":
+        raise ValueError("bad value 7")
+    if task == "disk":
+        raise StorageError("disk full")
+    assert isinstance(task, int)
+    return task * task
+
+
+def write_to_stderr_natively(text: str) -> None:
+    os.write(2, text.encode())
+
+
+def outcomes(tasks: list[int | str]) -> dict[int, int | TaskFailure]:
+    return {result.index: result.value for result in map_tasks(square_unless_told_otherwise, tasks, workers=2)}
+
+
+def test_every_task_gives_its_own_result() -> None:
+    assert outcomes([3, 4, 5]) == {0: 9, 1: 16, 2: 25}
+
+
+def test_a_child_that_dies_costs_only_its_own_task() -> None:
+    found = outcomes([1, 2, "die", 3, 4, 5, 6])
+    died = found.pop(2)
+    assert isinstance(died, TaskFailure)
+    assert died.crashed
+    assert "died" in died.reason
+    assert found == {0: 1, 1: 4, 3: 9, 4: 16, 5: 25, 6: 36}
+
+
+def test_an_error_becomes_a_failure_with_its_text() -> None:
+    failed = outcomes([1, "raise"])[1]
+    assert failed == TaskFailure(reason="ValueError: bad value 7", crashed=False)
+
+
+def test_a_full_disk_ends_the_run() -> None:
+    with pytest.raises(StorageError, match="disk full"):
+        outcomes(["disk"])
+
+
+def test_native_messages_go_to_the_log(tmp_path: Path) -> None:
+    log = tmp_path / "native.log"
+    list(map_tasks(write_to_stderr_natively, ["from the depths"], workers=1, log_file=log))
+    assert "from the depths" in log.read_text()
+
+
+def test_stopping_early_ends_the_children() -> None:
+    results = map_tasks(time.sleep, [0.0, 60.0, 60.0], workers=2)
+    started = time.monotonic()
+    next(results)
+    results.close()  # type: ignore[attr-defined]
+    assert time.monotonic() - started < 30

@@ -1,0 +1,293 @@
+"""The classical backbone's poses, on data that pycolmap synthesises and on made-up models."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from scenes import CAMERA, make_piece, points_ahead, rotation_about_y, walk
+
+from smust3r_colmap.backbones.classical.calibration import (
+    CalibrationTask,
+    agree_on_cameras,
+    calibrate_segment,
+    weighted_median,
+)
+from smust3r_colmap.backbones.classical.descriptors import vlad_descriptors
+from smust3r_colmap.backbones.classical.features import plan_pairs
+from smust3r_colmap.backbones.classical.mapping import (
+    MappedModel,
+    MappedSegment,
+    MappingTask,
+    epipolar_errors_px,
+    find_jumps,
+    map_segment,
+    restrict_model,
+)
+from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
+from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.geometry.sim3 import Sim3
+from smust3r_colmap.products import Segment, Tracks
+
+NUM_IMAGES = 8
+
+
+# --------------------------------------------------------------------- which pairs
+def test_small_segments_are_matched_exhaustively() -> None:
+    pairs = plan_pairs(Segment(index=0, images=(4, 5, 6, 7)), neighbours=2, exhaustive_below=4)
+    assert sorted(pairs) == [(4, 5), (4, 6), (4, 7), (5, 6), (5, 7), (6, 7)]
+
+
+def test_long_segments_match_neighbours_and_doubling_steps() -> None:
+    pairs = plan_pairs(Segment(index=0, images=tuple(range(100, 140))), neighbours=3, exhaustive_below=10)
+    from_first = sorted(b - 100 for a, b in pairs if a == 100)
+    assert from_first == [1, 2, 3, 4, 8, 16, 32]
+    assert len(set(pairs)) == len(pairs)
+    assert all(100 <= a < b < 140 for a, b in pairs)
+
+
+# --------------------------------------------------------------------------- folds
+def model_of_walk(num_images: int) -> MappedModel:
+    piece = make_piece(
+        walk(num_images), tuple(range(num_images)), points_ahead(50, np.random.default_rng(0)), Sim3.identity()
+    )
+    assert piece.tracks is not None
+    return MappedModel(
+        images=piece.images,
+        seg_from_cam=piece.seg_from_cam,
+        intrinsics=piece.intrinsics,
+        tracks=piece.tracks,
+        reprojection_error_px=0.3,
+        method="made up",
+    )
+
+
+def strong_neighbours(num_images: int) -> dict[tuple[int, int], int]:
+    return {(k, k + 1): 200 for k in range(num_images - 1)}
+
+
+def test_an_honest_walk_has_no_jumps() -> None:
+    assert find_jumps(model_of_walk(12), range(12), strong_neighbours(12)) == []
+
+
+def test_a_turn_between_matching_neighbours_is_a_jump() -> None:
+    model = model_of_walk(12)
+    model.seg_from_cam[7:, :, :3] = model.seg_from_cam[7:, :, :3] @ rotation_about_y(150.0)
+    assert find_jumps(model, range(12), strong_neighbours(12)) == [6]
+
+
+def test_a_leap_between_matching_neighbours_is_a_jump() -> None:
+    model = model_of_walk(12)
+    model.seg_from_cam[5:, 0, 3] += 15.0
+    assert find_jumps(model, range(12), strong_neighbours(12)) == [4]
+
+
+def test_neighbours_that_do_not_match_may_stand_apart() -> None:
+    model = model_of_walk(12)
+    model.seg_from_cam[5:, 0, 3] += 15.0
+    pairs = strong_neighbours(12)
+    pairs[4, 5] = 12
+    assert find_jumps(model, range(12), pairs) == []
+
+
+def test_moving_on_after_a_pause_is_not_a_jump() -> None:
+    model = model_of_walk(12)
+    model.seg_from_cam[:, 0, 3] *= 1e-3
+    model.seg_from_cam[6:, 0, 3] += 0.5
+    assert find_jumps(model, range(12), strong_neighbours(12)) == []
+
+
+def test_a_restricted_model_keeps_points_that_two_images_see() -> None:
+    model = model_of_walk(6)
+    once = replace(
+        model,
+        tracks=Tracks(
+            points_seg=model.tracks.points_seg[:3],
+            point_of_observation=np.array([0, 0, 1, 1, 2, 2]),
+            image_of_observation=np.array([0, 1, 1, 5, 4, 5]),
+            feature_of_observation=np.array([7, 8, 9, 10, 11, 12]),
+        ),
+    )
+    part = restrict_model(once, [3, 4, 5])
+    assert part.images == (3, 4, 5)
+    np.testing.assert_array_equal(part.tracks.points_seg, model.tracks.points_seg[2:3])
+    np.testing.assert_array_equal(part.tracks.point_of_observation, [0, 0])
+    np.testing.assert_array_equal(part.tracks.image_of_observation, [4, 5])
+    np.testing.assert_array_equal(part.tracks.feature_of_observation, [11, 12])
+
+
+def test_epipolar_errors_tell_a_true_relative_pose_from_a_folded_one() -> None:
+    model = model_of_walk(6)
+    points = model.tracks.points_seg
+    xy_img = []
+    for k in (2, 3):
+        cam_from_seg = np.linalg.inv(np.vstack([model.seg_from_cam[k], [0, 0, 0, 1]]))[:3]
+        xy_img.append(CAMERA.xy_img(points @ cam_from_seg[:, :3].T + cam_from_seg[:, 3]))
+    assert epipolar_errors_px(model, 2, xy_img[0], xy_img[1]).max() < 1e-6
+    off_px = epipolar_errors_px(model, 2, xy_img[0], xy_img[1] + [0.0, 3.0])
+    assert 1.0 < np.median(off_px) < 3.0
+    model.seg_from_cam[3:, :, :3] = model.seg_from_cam[3:, :, :3] @ rotation_about_y(150.0)
+    assert np.median(epipolar_errors_px(model, 2, xy_img[0], xy_img[1])) > 4.0
+
+
+# ------------------------------------------------------------------- pycolmap's maps
+@pytest.fixture(scope="module")
+def synthetic(tmp_path_factory: pytest.TempPathFactory) -> tuple[MappingTask, pycolmap.Reconstruction]:
+    """A noise-free database of eight images round a cloud, and the truth."""
+    path = tmp_path_factory.mktemp("synthetic") / "database.db"
+    pycolmap.set_random_seed(3)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs = 1
+    options.num_frames_per_rig = NUM_IMAGES
+    options.num_points3D = 300
+    with pycolmap.Database.open(path) as database:
+        truth = pycolmap.synthesize_dataset(options, database)
+    start = Intrinsics(model="SIMPLE_RADIAL", width=1024, height=768, params=(1200.0, 512.0, 384.0, 0.0))
+    images = tuple(range(NUM_IMAGES))
+    task = MappingTask(
+        segment=0,
+        database=path,
+        images=images,
+        camera_indices=(0,) * NUM_IMAGES,
+        pairs=plan_pairs(Segment(index=0, images=images), neighbours=8, exhaustive_below=25),
+        cameras=(start,),
+        trusted_focal={},
+        seed=0,
+    )
+    return task, truth
+
+
+def centre_error(model: MappedModel, truth: pycolmap.Reconstruction) -> float:
+    """Largest distance of a camera centre from the truth after the best similarity."""
+    true = np.array([truth.image(i + 1).projection_center() for i in model.images])
+    truth_from_model = pycolmap.estimate_sim3d(model.seg_from_cam[:, :, 3], true)
+    moved = np.array([truth_from_model * centre for centre in model.seg_from_cam[:, :, 3]])
+    return float(np.linalg.norm(moved - true, axis=1).max())
+
+
+def test_a_segment_is_mapped_to_rounding_without_noise(
+    synthetic: tuple[MappingTask, pycolmap.Reconstruction],
+) -> None:
+    task, truth = synthetic
+    mapped = map_segment(task)
+    (model,) = mapped.models
+    assert model.images == tuple(range(NUM_IMAGES))
+    assert not mapped.unregistered
+    assert centre_error(model, truth) < 1e-3
+    assert model.intrinsics[0].params == pytest.approx((1280.0, 512.0, 384.0, 0.05), rel=1e-3, abs=1e-3)
+
+
+def test_mapping_twice_gives_the_same_bits(synthetic: tuple[MappingTask, pycolmap.Reconstruction]) -> None:
+    first, second = map_segment(synthetic[0]), map_segment(synthetic[0])
+    np.testing.assert_array_equal(first.models[0].seg_from_cam, second.models[0].seg_from_cam)
+    np.testing.assert_array_equal(first.models[0].tracks.points_seg, second.models[0].tracks.points_seg)
+
+
+def test_images_without_matches_are_left_out_with_the_reason(
+    synthetic: tuple[MappingTask, pycolmap.Reconstruction],
+) -> None:
+    task, _ = synthetic
+    mapped = map_segment(replace(task, pairs=tuple(pair for pair in task.pairs if 7 not in pair)))
+    assert [left.image for left in mapped.unregistered] == [7]
+    assert mapped.unregistered[0].reason == "no verified matches to any image of its segment"
+
+
+def test_a_segment_without_matches_gives_nothing_and_says_so(
+    synthetic: tuple[MappingTask, pycolmap.Reconstruction],
+) -> None:
+    mapped = map_segment(replace(synthetic[0], pairs=()))
+    assert mapped.models == ()
+    assert mapped.attempts == ("no pair of images has 15 verified matches",)
+    assert len(mapped.unregistered) == NUM_IMAGES
+
+
+def test_mapped_segments_come_back_from_disk(
+    synthetic: tuple[MappingTask, pycolmap.Reconstruction], tmp_path: Path
+) -> None:
+    mapped = map_segment(synthetic[0])
+    write_mapped(tmp_path, mapped)
+    back = read_mapped(tmp_path)
+    assert (back.segment, back.attempts, back.unregistered) == (0, mapped.attempts, ())
+    assert back.models[0].intrinsics == mapped.models[0].intrinsics
+    np.testing.assert_array_equal(back.models[0].seg_from_cam, mapped.models[0].seg_from_cam)
+    np.testing.assert_array_equal(
+        back.models[0].tracks.feature_of_observation, mapped.models[0].tracks.feature_of_observation
+    )
+
+
+# ---------------------------------------------------------------------- calibration
+def test_the_weighted_median_follows_the_weight() -> None:
+    values = np.array([1.0, 2.0, 30.0])
+    assert weighted_median(values, np.array([1.0, 1.0, 1.0])) == 2.0
+    assert weighted_median(values, np.array([1.0, 1.0, 100.0])) == pytest.approx(30.0, abs=1.0)
+    assert weighted_median(np.array([5.0]), np.array([0.1])) == 5.0
+
+
+def test_one_diverged_segment_does_not_move_the_agreed_camera() -> None:
+    model = model_of_walk(6)
+    start = Intrinsics(model="SIMPLE_RADIAL", width=640, height=480, params=(700.0, 320.0, 240.0, 0.0))
+
+    def with_focal(focal: float) -> MappedModel:
+        return replace(model, intrinsics=(replace(start, params=(focal, 320.0, 240.0, 0.01)),) * 6)
+
+    segments = [read_only_segment(k, with_focal(focal)) for k, focal in enumerate([520.0, 525.0, 853.0, 528.0, 526.0])]
+    agreed = agree_on_cameras(segments, [0] * 6, [start])
+    assert agreed[0].params[0] == pytest.approx(526.0, abs=2.0)
+    assert agreed[0].params[3] == pytest.approx(0.01)
+
+
+def read_only_segment(number: int, model: MappedModel) -> MappedSegment:
+    return MappedSegment(segment=number, models=(model,), attempts=(), unregistered=())
+
+
+def test_a_camera_seen_by_one_model_only_is_left_to_it() -> None:
+    assert agree_on_cameras([read_only_segment(0, model_of_walk(6))], [0] * 6, [CAMERA]) == {}
+
+
+def test_adjusting_to_the_agreed_camera_fixes_it_exactly(
+    synthetic: tuple[MappingTask, pycolmap.Reconstruction],
+) -> None:
+    task, truth = synthetic
+    agreed = {0: replace(task.cameras[0], params=(1280.0, 512.0, 384.0, 0.05))}
+    calibrated = calibrate_segment(CalibrationTask(mapping=task, mapped=map_segment(task), agreed=agreed))
+    (model,) = calibrated.models
+    assert model.intrinsics[0].params == (1280.0, 512.0, 384.0, 0.05)
+    assert centre_error(model, truth) < 1e-4
+    assert "adjusted to the agreed camera" in calibrated.attempts[-1]
+
+
+def test_a_model_that_the_agreed_camera_does_not_fit_keeps_its_own(
+    synthetic: tuple[MappingTask, pycolmap.Reconstruction],
+) -> None:
+    task, truth = synthetic
+    agreed = {0: replace(task.cameras[0], params=(1180.0, 512.0, 384.0, -0.2))}
+    calibrated = calibrate_segment(CalibrationTask(mapping=task, mapped=map_segment(task), agreed=agreed))
+    (model,) = calibrated.models
+    assert model.intrinsics[0].params[0] == pytest.approx(1280.0, rel=1e-3)
+    assert centre_error(model, truth) < 1e-3
+    assert "keep their own focal length" in calibrated.attempts[-1]
+
+
+# ---------------------------------------------------------------------- descriptors
+def test_descriptors_of_alike_images_are_alike() -> None:
+    rng = np.random.default_rng(0)
+    places = [rng.integers(0, 120, size=(300, 128), dtype=np.uint8) for _ in range(4)]
+    again = [
+        np.clip(place.astype(int) + rng.integers(-6, 7, size=place.shape), 0, 255).astype(np.uint8) for place in places
+    ]
+    vlad = vlad_descriptors([*places, *again], rng=np.random.default_rng(1))
+    similarity = vlad[:4] @ vlad[4:].T
+    np.testing.assert_allclose(np.linalg.norm(vlad, axis=1), 1.0, atol=1e-5)
+    assert (similarity.argmax(axis=1) == np.arange(4)).all()
+    assert similarity.diagonal().min() > 0.5 > np.abs(similarity - np.diag(similarity.diagonal())).max()
+
+
+def test_an_image_without_features_has_a_zero_descriptor() -> None:
+    rng = np.random.default_rng(0)
+    some = rng.integers(0, 120, size=(300, 128), dtype=np.uint8)
+    vlad = vlad_descriptors([some, np.zeros((0, 128), np.uint8)], rng=rng)
+    assert not vlad[1].any()
+    assert vlad[0].any()
