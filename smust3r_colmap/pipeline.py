@@ -16,7 +16,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from smust3r_colmap import fusion
-from smust3r_colmap.alignment.edges import Edges, align_pieces, candidate_pairs
+from smust3r_colmap.alignment.edges import Edges, align_pieces, candidate_pairs, needs_maps
 from smust3r_colmap.backbones.base import Backbone, BackboneResult
 from smust3r_colmap.backbones.classical.backbone import ClassicalBackbone
 from smust3r_colmap.chaining import ChainedPart, chain_pieces
@@ -115,7 +115,8 @@ def _refuse_nothing(result: BackboneResult, collection: ImageCollection) -> None
 def _align(result: BackboneResult, config: RunConfig, run: RunDirectory, clock: StageClock) -> Edges:
     """Sim(3) between all pieces that have something in common (paper eqs. 1 and 2)."""
     geometry = [(piece.name, piece.images, piece.seg_from_cam, piece.tracks) for piece in result.pieces]
-    stored = run.stage("alignment", key=key_of("alignment", geometry, config.alignment, config.classical, config.seed))
+    maps = result.dense_key if needs_maps(result.pieces, config.alignment) else None
+    stored = run.stage("alignment", key=key_of("alignment", geometry, maps, config.alignment, config.seed))
     with clock.stage("alignment", total=len(candidate_pairs(result.pieces))) as stage:
         if stored.is_done:
             stage.skip(len(candidate_pairs(result.pieces)))
@@ -138,7 +139,7 @@ def _fuse(
 ) -> tuple[Scene, ...]:
     """Every image once, one camera set and one cloud for every connected part, largest first."""
     poses = [[(world_from.matrix, result.pieces[p].seg_from_cam) for p, world_from in _members(part)] for part in parts]
-    stored = run.stage("scene", key=key_of("scene", poses, config.fusion, config.classical))
+    stored = run.stage("scene", key=key_of("scene", poses, result.dense_key, config.fusion))
     camera_of_image = [image.camera for image in collection.images]
     with clock.stage("fusion", total=len(parts)) as stage:
         if stored.is_done:

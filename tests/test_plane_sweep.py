@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 import pytest
-from scipy.ndimage import binary_erosion
+from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.backbones.classical.plane_sweep import (
@@ -257,6 +257,10 @@ def test_pixels_without_depth_agree_with_nothing(shots: list[Shot]) -> None:
     holed[:, :50] = 0.0
     assert (check_consistency(camera, holed, [(camera, truth)], tolerance=0.02)[:, :50] == 0).all()
     assert (check_consistency(camera, truth, [(camera, holed)], tolerance=0.02)[:, :50] == 0).all()
+    # From one unit behind, depth 0 is the reference's own centre, at depth 1: a map of ones must not confirm it.
+    behind = replace(camera, cam_from_seg=camera.cam_from_seg + np.array([0.0, 0.0, 1.0])[:, None] * [0, 0, 0, 1])
+    ones = np.ones_like(truth)
+    assert (check_consistency(camera, holed, [(behind, ones)], tolerance=0.02)[:, :50] == 0).all()
 
 
 # ------------------------------------------------------------------------ whole pieces
@@ -317,10 +321,25 @@ def test_maps_of_the_pinhole_view_come_back_to_the_distorted_pixels(camera: Intr
     assert np.median(error) < 1e-4
     assert (error < 1e-3).mean() > 0.95
     assert (confidence == 3.0).mean() > 0.98
+    around_face = binary_dilation(truth.on_face, iterations=3)
+    assert not ((depth > 2.75) & (depth < 3.5))[around_face].any()  # neither the face nor the wall
     view = rectifier.view(truth.rgb, np.eye(4)[:3])
     inside = view.interior > 0
     assert 0.1 < np.median(np.abs(view.grey - in_view.rgb[..., 0])[inside]) < grey_bound
     assert 0.3 < inside.mean() < 1.0
+
+
+def test_a_view_leaves_out_what_lies_beyond_the_fold_of_the_distortion() -> None:
+    """r - 0.4 r^3 turns back at r = 0.913: rays further out would land on the image a second time."""
+    rectifier = Rectifier.of(replace(BARREL, params=(110, 64, 48, -0.4)), 128)
+    pixels = pixel_centres(rectifier.view_width, rectifier.view_height)
+    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(rectifier.img_from_cam).T
+    beyond = (np.linalg.norm(rays[:, :2], axis=1) > 0.95).reshape(rectifier.view_height, rectifier.view_width)
+    assert rectifier.grid_from_view is not None
+    assert beyond.sum() > 100
+    assert (rectifier.grid_from_view[:, beyond] < 0).all()
+    assert (rectifier.interior[beyond] == 0).all()
+    assert rectifier.interior.mean() > 0.3
 
 
 def test_images_without_distortion_are_not_resampled() -> None:
@@ -352,6 +371,30 @@ def test_two_images_reach_confidence_two_and_no_more(shots: list[Shot]) -> None:
         error = relative_error(found, shot.depth, 2.0)
         assert error.size > 0.4 * shot.depth.size
         assert 1e-5 < np.median(error) < 0.006
+
+
+def test_views_that_are_unlike_confirm_less(shots: list[Shot]) -> None:
+    """Under noise many agreeing pixels have an NCC below the sure one and no longer count in full."""
+    rng = np.random.default_rng(5)
+    clean = shots[1:3]
+    noisy = [
+        replace(shot, rgb=np.clip(shot.rgb + rng.normal(0, 35, (96, 128, 1)), 0, 255).astype(np.uint8))
+        for shot in clean
+    ]
+    for pair, low, high in ((clean, 0.65, 1.0), (noisy, 0.2, 0.5)):
+        for found in reconstruct(pair, sparse_points(pair)):
+            confirmed = found.confidence > 1.2
+            assert confirmed.mean() > 0.2
+            assert low < (found.confidence[confirmed] == 2.0).mean() < high
+
+
+def test_forward_motion_gives_depth() -> None:
+    """Parallax is nothing at the centre and grows outwards; near planes lie behind the views ahead."""
+    shots = [shoot(PINHOLE, (0.02 * (-1) ** k, 0.02 * k, 0.35 * k)) for k in range(5)]
+    for found, shot in zip(reconstruct(shots, sparse_points(shots)), shots, strict=True):
+        error = relative_error(found, shot.depth, 2.0)
+        assert error.size > 0.2 * shot.depth.size
+        assert 1e-5 < np.median(error) < 0.02
 
 
 def test_images_that_only_turn_get_empty_maps() -> None:

@@ -85,6 +85,13 @@ def align_pieces(
     return Edges(alignments=tuple(alignments), failures=tuple(failures))
 
 
+def needs_maps(pieces: Sequence[SegmentPiece], settings: AlignmentConfig) -> bool:
+    """Whether any pair may be aligned by its pointmaps."""
+    return settings.alignment_source == "pointmaps" or (
+        settings.alignment_source == "auto" and any(piece.tracks is None for piece in pieces)
+    )
+
+
 def candidate_pairs(pieces: Sequence[SegmentPiece]) -> tuple[tuple[int, int], ...]:
     """Pairs that share an image, or belong to the same or to neighbouring segments."""
     images = [set(piece.images) for piece in pieces]

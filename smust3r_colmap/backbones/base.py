@@ -26,12 +26,14 @@ class BackboneResult:
     Args:
         reconstructions: one per segment, in order.
         dense: maps of every piece, in the order in which ``pieces`` lists them.
+        dense_key: hash of all that the maps were made from.
         links: verified matches, where the backbone has features.
         rejected: images that the backbone could not use at all.
     """
 
     reconstructions: tuple[SegmentReconstruction, ...]
     dense: tuple[DenseMaps, ...]
+    dense_key: str
     links: FeatureLinks | None
     rejected: tuple[RejectedImage, ...]
 

@@ -73,10 +73,11 @@ class ClassicalBackbone:
         tasks = [self._mapping_task(segment, pairs[segment.index], database, collection) for segment in segments]
         mapped = self._map(tasks, collection, run, features.key, reporter)
         reconstructions = [_reconstruction(one, descriptors) for one in mapped]
-        dense = self._dense([p for r in reconstructions for p in r.pieces], collection, run, reporter)
+        dense, dense_key = self._dense([p for r in reconstructions for p in r.pieces], collection, run, reporter)
         return BackboneResult(
             reconstructions=tuple(reconstructions),
-            dense=tuple(dense),
+            dense=dense,
+            dense_key=dense_key,
             links=_read_links(database, sorted(set().union(*pairs.values()))),
             rejected=rejected,
         )
@@ -200,8 +201,8 @@ class ClassicalBackbone:
 
     def _dense(
         self, pieces: Sequence[SegmentPiece], collection: ImageCollection, run: RunDirectory, reporter: Reporter
-    ) -> list[StoredMaps]:
-        """Maps of every piece; a piece whose sweep failed gets empty ones and a warning."""
+    ) -> tuple[tuple[StoredMaps, ...], str]:
+        """Maps of every piece and their common key; a piece whose sweep failed gets empty ones and a warning."""
         tasks = []
         for piece in pieces:
             images = tuple(collection.images[i] for i in piece.images)
@@ -228,7 +229,8 @@ class ClassicalBackbone:
                     reporter.warn(f"segment {task.piece.name} has no depth maps: {result.value.reason}")
                     make_no_depth(task)
                 stage.advance(len(task.images))
-        return [StoredMaps(task.folder.path, task.piece) for task in tasks]
+        maps = tuple(StoredMaps(task.folder.path, task.piece) for task in tasks)
+        return maps, key_of([task.folder.key for task in tasks])
 
 
 def _segment_stage(run: RunDirectory, segment: int, name: str, key: str) -> StageFolder:

@@ -81,6 +81,7 @@ def choose_neighbours(
 ) -> tuple[int, ...]:
     """The most useful neighbours of one camera, best first.
 
+    A camera at the same place, the reference itself among them, has no parallax and is never chosen.
     A neighbour scores by the share of the points that it contains, each weighted by a log-normal
     function of the parallax angle. Neighbours on the same side of the reference count less.
 
@@ -98,7 +99,6 @@ def choose_neighbours(
     parallax_deg = _parallax_deg(points, centres[reference], centres)
     usable = in_view.mean(axis=1) >= MIN_OVERLAP
     usable &= (in_view & (parallax_deg >= MIN_PARALLAX_DEG)).sum(axis=1) > 0.5 * in_view.sum(axis=1)
-    usable[reference] = False
     scores = np.where(usable, (_parallax_weight(parallax_deg) * in_view).mean(axis=1), 0.0)
     baselines = centres - centres[reference]
     directions = baselines / np.maximum(np.linalg.norm(baselines, axis=1, keepdims=True), 1e-12)

@@ -1,0 +1,249 @@
+"""Whole runs on a small rendered room, with the truth known exactly."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+import trimesh
+from read_colmap_independently import read_binary
+
+from smust3r_colmap.config import ClassicalConfig, FusionConfig, OutputConfig, RunConfig, SegmentationConfig
+from smust3r_colmap.demo import write_demo
+from smust3r_colmap.errors import ConfigError, ReconstructionError
+from smust3r_colmap.evaluation import compare_trajectories, read_poses_txt, read_reference_sparse
+from smust3r_colmap.pipeline import reconstruct
+from smust3r_colmap.progress import QuietReporter
+from smust3r_colmap.summary import RunSummary
+
+NUM_IMAGES = 24
+
+CONFIG = RunConfig(
+    segmentation=SegmentationConfig(segment_length=14, overlap=7),
+    classical=ClassicalConfig(max_features=1200, dense_size=160, depth_planes=32),
+    fusion=FusionConfig(max_points=20_000),
+    output=OutputConfig(text=True),
+)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("room")
+    write_demo(folder, num_images=NUM_IMAGES, width=320, height=240)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(room: Path, tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
+    return run(room / "images", tmp_path_factory.mktemp("run") / "out")
+
+
+def run(images: Path, output: Path, config: RunConfig = CONFIG) -> RunSummary:
+    return reconstruct(images, output, config, reporter=QuietReporter(sys.stderr))
+
+
+def reused(summary: RunSummary) -> dict[str, bool]:
+    return {stage.name: stage.reused for stage in summary.stages}
+
+
+# --------------------------------------------------------------------------- result
+def test_every_image_is_placed_within_centimetres_of_the_truth(finished: RunSummary, room: Path) -> None:
+    assert finished.num_registered == NUM_IMAGES
+    assert finished.exit_code == 0
+    assert len(finished.models) == 1
+    found = compare_trajectories(
+        read_reference_sparse(finished.output / "sparse/0"), read_poses_txt(room / "poses.txt")
+    )
+    assert found.num_compared == NUM_IMAGES
+    assert 0 < found.position_rmse < 0.03
+    assert 0 < found.rotation_median_deg < 1.0
+
+
+def test_the_focal_length_is_found_at_the_original_size(finished: RunSummary, room: Path) -> None:
+    (camera,) = pycolmap.Reconstruction(finished.output / "sparse/0").cameras.values()
+    width, height, focal = (float(x) for x in (room / "intrinsics.txt").read_text().split("\n")[1].split()[:3])
+    assert (camera.width, camera.height) == (width, height)
+    assert camera.params[0] == pytest.approx(focal, rel=0.02)
+    assert tuple(camera.params[1:3]) == (width / 2, height / 2)
+
+
+def test_the_model_is_read_by_an_independent_reader(finished: RunSummary) -> None:
+    model = read_binary(finished.output / "sparse/0")
+    ours = pycolmap.Reconstruction(finished.output / "sparse/0")
+    assert sorted(image.name for image in model.images.values()) == [f"{k:06d}.jpg" for k in range(NUM_IMAGES)]
+    assert {i: image.name for i, image in model.images.items()} == {i: f"{i - 1:06d}.jpg" for i in model.images}
+    assert len(model.points) == len(ours.points3D) == finished.models[0].num_points
+    assert (finished.output / "sparse/0/images.txt").is_file()
+
+
+def test_the_cloud_lies_inside_the_room_and_on_its_walls(finished: RunSummary, room: Path) -> None:
+    """The room spans x -3..3, y -2..2, z 0..3 m; the cameras look level, so floor and ceiling are hardly seen."""
+    estimated, truth = read_reference_sparse(finished.output / "sparse/0"), read_poses_txt(room / "poses.txt")
+    fit = compare_trajectories(estimated, truth).reference_from_estimated
+    cloud = trimesh.load(finished.output / "points.ply")
+    points = fit.apply(np.asarray(cloud.vertices))
+    assert 5_000 < len(points) <= CONFIG.fusion.max_points
+    beyond = np.maximum(np.array([-3.0, -2.0, 0.0]) - points, points - [3.0, 2.0, 3.0]).max(axis=1)
+    assert np.mean(beyond > 0.05) < 0.02
+    to_wall = np.abs(np.abs(points[:, :2]) - [3.0, 2.0]).min(axis=1)
+    assert np.mean(to_wall < 0.05) > 0.4
+
+
+def test_all_results_are_written(finished: RunSummary) -> None:
+    names = {path.name for path in finished.output.iterdir()}
+    assert names == {"sparse", "points.ply", "scene.glb", "trajectory_tum.txt", "summary.json", "config.toml", "work"}
+    facts = json.loads((finished.output / "summary.json").read_text())
+    assert facts["num_registered"] == NUM_IMAGES
+    assert facts["models"][0]["metric"] is False
+    assert "arbitrary" in facts["scale"]
+    assert len((finished.output / "trajectory_tum.txt").read_text().splitlines()) >= NUM_IMAGES
+
+
+def test_neighbouring_segments_agree_on_what_they_share(finished: RunSummary) -> None:
+    accepted = [edge for edge in finished.edges if edge.accepted]
+    assert len(accepted) >= len(finished.segments) - 1 >= 2
+    assert all(edge.relative_residual < 0.01 for edge in accepted)
+
+
+# --------------------------------------------------------------------------- resume
+def test_a_second_start_repeats_nothing_and_gives_the_same_model(finished: RunSummary, room: Path) -> None:
+    before = (finished.output / "sparse/0/images.bin").read_bytes()
+    again = run(room / "images", finished.output)
+    assert (finished.output / "sparse/0/images.bin").read_bytes() == before
+    computed = {name for name, was_reused in reused(again).items() if not was_reused}
+    assert computed == {"import", "export"}
+
+
+def test_a_changed_setting_redoes_its_stage_and_what_follows(finished: RunSummary, room: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "out"
+    shutil.copytree(finished.output, copy)
+    denser = replace(CONFIG, classical=replace(CONFIG.classical, dense_size=120))
+    again = reused(run(room / "images", copy, denser))
+    assert {name for name, was_reused in again.items() if was_reused} == {
+        "features", "matching", "mapping", "calibration", "alignment",
+    }  # fmt: skip
+    fewer_points = replace(denser, fusion=FusionConfig(max_points=5_000))
+    again = reused(run(room / "images", copy, fewer_points))
+    assert not again["fusion"]
+    assert again["depth"]
+    assert again["alignment"]
+
+
+KILL_AFTER = ("features: ", "matching: ", "mapping: ", "depth: ", "fusion: ")
+
+
+@pytest.mark.parametrize("line", KILL_AFTER)
+def test_killed_in_the_middle_of_a_stage_it_goes_on_to_the_same_model(
+    line: str, finished: RunSummary, room: Path, tmp_path: Path
+) -> None:
+    """kill -9 when the stage begins; only the import and what was not finished may be done again."""
+    output = tmp_path / "out"
+    config = tmp_path / "config.toml"
+    shutil.copy(finished.output / "config.toml", config)
+    stages = ["features", "matching", "mapping", "calibration", "depth", "alignment", "fusion"]
+    reached = stages.index(line.split(":", maxsplit=1)[0])
+    prepared = _copy_of_finished_stages(finished.output, output, stages[:reached])
+    command = [sys.executable, "-m", "smust3r_colmap", "reconstruct", str(room / "images")]
+    command += ["--output", str(output), "--config", str(config)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:
+        assert process.stderr is not None
+        for said in process.stderr:
+            if said.startswith(line) and "to do" in said:
+                process.kill()
+                break
+    assert process.returncode == -9
+    assert not (output / "summary.json").exists()
+    again = reused(run(room / "images", output))
+    assert all(again[name] for name in prepared)
+    for name in ("images.bin", "points3D.bin", "cameras.bin"):
+        found = (output / "sparse/0" / name).read_bytes()
+        assert found == (finished.output / "sparse/0" / name).read_bytes(), name
+
+
+def _copy_of_finished_stages(source: Path, output: Path, stages: list[str]) -> list[str]:
+    """A run directory in which just these stages are finished, as a run stopped there leaves it."""
+    folders = {"features": ["features"], "matching": [], "alignment": ["alignment"], "fusion": ["scene"]}
+    for stage in stages:
+        for name in folders.get(stage, []):
+            shutil.copytree(source / "work" / name, output / "work" / name)
+        for segment in sorted((source / "work/segments").iterdir()):
+            for part in segment.glob(f"{stage}*"):
+                shutil.copytree(part, output / "work/segments" / segment.name / part.name)
+    (output / "work").mkdir(parents=True, exist_ok=True)
+    if "features" in stages and "matching" not in stages:
+        with pycolmap.Database.open(output / "work/features/database.db") as database:
+            database.clear_matches()
+            database.clear_two_view_geometries()
+    return stages
+
+
+# ------------------------------------------------------------------------- bad input
+def write_noise(folder: Path, count: int) -> None:
+    """Pictures that SIFT finds a lot in and that have nothing in common."""
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    for k in range(count):
+        coarse = rng.integers(0, 255, size=(30, 40, 3), dtype=np.uint8)
+        cv2.imwrite(str(folder / f"{k}.png"), cv2.resize(coarse, (320, 240), interpolation=cv2.INTER_CUBIC))
+
+
+def test_images_without_overlap_fail_with_what_was_tried(tmp_path: Path) -> None:
+    write_noise(tmp_path / "noise", 4)
+    with pytest.raises(ReconstructionError, match=r"none of the 1 segments \(4 images\).*no pair of images has 15"):
+        run(tmp_path / "noise", tmp_path / "out")
+
+
+def test_strangers_among_the_images_are_left_out_by_name(room: Path, tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    for k in range(10):
+        shutil.copy(room / "images" / f"{k:06d}.jpg", images)
+    write_noise(tmp_path / "noise", 1)
+    shutil.copy(tmp_path / "noise/0.png", images / "000004_stranger.png")
+    (images / "000005_broken.jpg").write_bytes((room / "images/000005.jpg").read_bytes()[:4000])
+    summary = run(images, tmp_path / "out")
+    assert summary.exit_code == 3
+    assert summary.num_registered == 10
+    assert [one.name for one in summary.unregistered] == ["000004_stranger.png"]
+    assert [one.name for one in summary.rejected] == ["000005_broken.jpg"]
+
+
+def test_two_unconnected_rooms_become_two_models_largest_first(room: Path, tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    write_demo(tmp_path / "other", num_images=24, width=320, height=240, seed=5)
+    for k in range(6):
+        shutil.copy(tmp_path / f"other/images/{k:06d}.jpg", images / f"a{k}.jpg")
+    for k in range(10):
+        shutil.copy(room / f"images/{k:06d}.jpg", images / f"b{k}.jpg")
+    summary = run(images, tmp_path / "out", replace(CONFIG, segmentation=SegmentationConfig()))
+    assert [model.num_images for model in summary.models] == [10, 6]
+    assert summary.exit_code == 3
+    assert any("2 models" in reason for reason in summary.weak_reasons)
+    first = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
+    assert {image.name[0] for image in first.images.values()} == {"b"}
+    assert pycolmap.Reconstruction(tmp_path / "out/sparse/1").num_reg_images() == 6
+
+
+def test_odd_names_survive_to_the_model(room: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "bilder mit Leerzeichen" / "süd"
+    folder.mkdir(parents=True)
+    for k in range(6):
+        shutil.copy(room / "images" / f"{k:06d}.jpg", folder / f"photo {k} ñ.jpg")
+    summary = run(folder.parent, tmp_path / "out put", replace(CONFIG, output=OutputConfig()))
+    names = {image.name for image in pycolmap.Reconstruction(summary.output / "sparse/0").images.values()}
+    assert names == {f"süd/photo {k} ñ.jpg" for k in range(6)}
+
+
+def test_an_output_among_the_images_is_refused(room: Path) -> None:
+    with pytest.raises(ConfigError, match="inside the image folder"):
+        run(room / "images", room / "images" / "out")
+    assert not (room / "images/out").exists()
