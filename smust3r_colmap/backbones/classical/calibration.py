@@ -19,6 +19,7 @@ import pycolmap
 
 from smust3r_colmap.backbones.classical.features import internal_name
 from smust3r_colmap.backbones.classical.mapping import (
+    ENOUGH_REGISTERED,
     FOCAL_TOLERANCE,
     MappedModel,
     MappedSegment,
@@ -28,6 +29,7 @@ from smust3r_colmap.backbones.classical.mapping import (
 )
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.products import UnregisteredImage
 
 logger = logging.getLogger(__name__)
 
@@ -88,7 +90,11 @@ def calibrate_segment(task: CalibrationTask) -> MappedSegment:
     """Map again what diverged, then adjust every model with the agreed cameras held fixed."""
     mapped = task.mapped
     trusted = {camera: intrinsics.focal_px for camera, intrinsics in task.agreed.items()}
-    if any(_diverged(model, task.mapping, trusted) for model in mapped.models):
+    sound = [model for model in mapped.models if not _diverged(model, task.mapping, trusted)]
+    placed = {image for model in sound for image in model.images}
+    if len(placed) >= ENOUGH_REGISTERED * len(task.mapping.images):
+        mapped = replace(mapped, models=tuple(sound), unregistered=left_over(task.mapping, sound, mapped.unregistered))
+    elif len(sound) < len(mapped.models):
         start = tuple(task.agreed.get(index, camera) for index, camera in enumerate(task.mapping.cameras))
         again = map_segment(replace(task.mapping, cameras=start, trusted_focal=trusted))
         mapped = replace(
@@ -101,6 +107,19 @@ def calibrate_segment(task: CalibrationTask) -> MappedSegment:
         models.append(adjusted)
         notes.append(note)
     return replace(mapped, models=tuple(models), attempts=(*mapped.attempts, *notes))
+
+
+def left_over(
+    task: MappingTask, models: Sequence[MappedModel], known: Sequence[UnregisteredImage]
+) -> tuple[UnregisteredImage, ...]:
+    """Images of the segment in none of ``models``, with the reason where one is known already."""
+    placed = {image for model in models for image in model.images}
+    reasons = {one.image: one.reason for one in known}
+    return tuple(
+        UnregisteredImage(image=image, reason=reasons.get(image, "its model's focal length diverged"))
+        for image in task.images
+        if image not in placed
+    )
 
 
 def _diverged(model: MappedModel, mapping: MappingTask, trusted: Mapping[int, float]) -> bool:

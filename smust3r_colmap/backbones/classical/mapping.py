@@ -47,6 +47,9 @@ STRONG_PAIR_INLIERS = 30
 """Verified matches that make two images certain neighbours (COLMAP's own bar for registration)."""
 NEAR_OFFSET = 4
 """Reach of the pairs that are left when the longer ones folded the model."""
+MIN_FOCAL_RATIO, MAX_FOCAL_RATIO = 0.2, 8.0
+"""Focal length over the longer side, from a 136 degree lens to a 7 degree one; a few images in a row
+on nearly parallel rays self-calibrate to anything."""
 FOCAL_TOLERANCE = 0.15
 """A focal length farther from the run's median belongs to a diverged self-calibration."""
 
@@ -262,6 +265,10 @@ class _Ladder:
         """Why a model cannot be believed, or nothing. Its pixels look perfect in every such case."""
         if not np.isfinite(model.reprojection_error_px) or model.reprojection_error_px > 3.0:
             return f"mean reprojection error {model.reprojection_error_px:.2f} px"
+        for intrinsics in set(model.intrinsics):
+            ratio = intrinsics.focal_px / max(intrinsics.width, intrinsics.height)
+            if not MIN_FOCAL_RATIO <= ratio <= MAX_FOCAL_RATIO:
+                return f"focal length {intrinsics.focal_px:.0f} px is {ratio:.1f} times the longer side"
         camera_of = dict(zip(self.task.images, self.task.camera_indices, strict=True))
         for image, intrinsics in zip(model.images, model.intrinsics, strict=True):
             trusted = self.task.trusted_focal.get(camera_of[image])
