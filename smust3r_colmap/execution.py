@@ -128,19 +128,30 @@ def _run_until_broken(
 
 def _guarded(function: Callable[[TaskT], ResultT], task: TaskT) -> ResultT | TaskFailure:
     """An error of the task becomes its result; a full disk and mistakes of ours still end the run."""
+    import cv2  # noqa: PLC0415  (only children pay for it)
+
     try:
         return function(task)
     except StorageError:
         raise
-    except (SmustrError, ValueError, IndexError, RuntimeError, OSError, MemoryError, ArithmeticError) as error:
+    except (
+        SmustrError,
+        ValueError,
+        IndexError,
+        RuntimeError,
+        OSError,
+        MemoryError,
+        ArithmeticError,
+        cv2.error,
+    ) as error:
         logger.exception("task failed")
         return TaskFailure(reason=f"{type(error).__name__}: {error}", crashed=False)
 
 
 def _start_child(parent_pid: int, log_file: str | None) -> None:
-    """One thread per child, native messages to the log, and never outlive the parent."""
+    """One OpenCV thread per child, native messages to the log, and never outlive the parent by more than a moment."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    target = os.open(log_file or os.devnull, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    target = os.open(log_file or os.devnull, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
     os.dup2(target, 2)
     os.close(target)
     import cv2  # noqa: PLC0415  (only children pay for it)

@@ -25,7 +25,7 @@ from smust3r_colmap.config_file import config_to_toml
 from smust3r_colmap.errors import ReconstructionError
 from smust3r_colmap.execution import usable_cores
 from smust3r_colmap.exporters.aside import replace_file
-from smust3r_colmap.exporters.colmap_sparse import refuse_names_text_cannot_hold, write_colmap_sparse
+from smust3r_colmap.exporters.colmap_sparse import MODEL_FILES, refuse_names_text_cannot_hold, write_colmap_sparse
 from smust3r_colmap.exporters.glb import write_glb
 from smust3r_colmap.exporters.ply import write_ply
 from smust3r_colmap.exporters.tum_trajectory import write_tum
@@ -36,7 +36,7 @@ from smust3r_colmap.importers.image_folder import (
     collection_from_scan,
     scan_image_folder,
 )
-from smust3r_colmap.products import ImageCollection, Scene, Segment, largest_first
+from smust3r_colmap.products import ImageCollection, Scene, Segment, SegmentPiece, largest_first
 from smust3r_colmap.progress import Reporter
 from smust3r_colmap.run_directory import RunDirectory, key_of, read_json, write_json
 from smust3r_colmap.segmentation.windows import plan_windows
@@ -82,12 +82,15 @@ def reconstruct(
 
 def _import(images: Path, config: RunConfig, run: RunDirectory, clock: StageClock) -> ImageCollection:
     """Read the folder; files that did not change since an earlier start are not decoded again."""
+    stored = run.stage("import", key=key_of("import"))
     with clock.stage("import", total=1) as stage:
         known = {}
-        if run.import_records.is_file():
-            known = {facts["name"]: ImportRecord.from_json(facts) for facts in read_json(run.import_records)}
+        if stored.is_done:
+            records = (ImportRecord.from_json(facts) for facts in read_json(stored.path / "records.json"))
+            known = {record.name: record for record in records}
         scan = scan_image_folder(images, known=known, workers=config.workers)
-        write_json(run.import_records, [record.to_json() for record in scan.records])
+        with stored.write() as folder:
+            write_json(folder / "records.json", [record.to_json() for record in scan.records])
         collection = collection_from_scan(scan, config.importing)
         if config.output.text:
             refuse_names_text_cannot_hold(image.name for image in collection.images)
@@ -116,7 +119,8 @@ def _align(result: BackboneResult, config: RunConfig, run: RunDirectory, clock: 
     """Sim(3) between all pieces that have something in common (paper eqs. 1 and 2)."""
     geometry = [(piece.name, piece.images, piece.seg_from_cam, piece.tracks) for piece in result.pieces]
     maps = result.dense_key if needs_maps(result.pieces, config.alignment) else None
-    stored = run.stage("alignment", key=key_of("alignment", geometry, maps, config.alignment, config.seed))
+    inputs = (geometry, maps, result.links)
+    stored = run.stage("alignment", key=key_of("alignment", inputs, config.alignment, config.seed))
     with clock.stage("alignment", total=len(candidate_pairs(result.pieces))) as stage:
         if stored.is_done:
             stage.skip(len(candidate_pairs(result.pieces)))
@@ -138,8 +142,10 @@ def _fuse(
     clock: StageClock,
 ) -> tuple[Scene, ...]:
     """Every image once, one camera set and one cloud for every connected part, largest first."""
-    poses = [[(world_from.matrix, result.pieces[p].seg_from_cam) for p, world_from in _members(part)] for part in parts]
-    stored = run.stage("scene", key=key_of("scene", poses, result.dense_key, config.fusion))
+    inputs = [
+        [_scene_input(result.pieces[p], world_from, collection) for p, world_from in _members(part)] for part in parts
+    ]
+    stored = run.stage("scene", key=key_of("scene", inputs, result.dense_key, config.fusion))
     camera_of_image = [image.camera for image in collection.images]
     with clock.stage("fusion", total=len(parts)) as stage:
         if stored.is_done:
@@ -171,6 +177,13 @@ def _members(part: ChainedPart) -> list[tuple[int, Sim3]]:
     return list(zip(part.pieces, part.world_from_seg, strict=True))
 
 
+def _scene_input(piece: SegmentPiece, world_from_seg: Sim3, collection: ImageCollection) -> tuple[object, ...]:
+    """What a piece puts into a scene besides its maps; the names too, for files may be renamed."""
+    images = [collection.images[index] for index in piece.images]
+    names = [(image.name, image.camera) for image in images]
+    return piece.name, world_from_seg.matrix, piece.images, names, piece.seg_from_cam, piece.intrinsics
+
+
 def _without_repeats(scenes: tuple[Scene, ...]) -> tuple[Scene, ...]:
     """Leave out a small part all of whose images stand in larger ones."""
     kept: list[Scene] = []
@@ -185,7 +198,7 @@ def _without_repeats(scenes: tuple[Scene, ...]) -> tuple[Scene, ...]:
 def _export(scenes: tuple[Scene, ...], config: RunConfig, run: RunDirectory, clock: StageClock) -> None:
     """Every model for COLMAP; cloud, viewer file and trajectory of the largest."""
     with clock.stage("export", total=len(scenes)) as stage:
-        run.clear_results()
+        run.clear_results(MODEL_FILES)
         for number, scene in enumerate(scenes):
             write_colmap_sparse(scene, run.sparse_model(number), text=config.output.text)
             stage.advance()
@@ -206,6 +219,7 @@ def _summarise(
 ) -> RunSummary:
     placed = {image for scene in scenes for image in scene.image_indices}
     why = {left.image: left.reason for one in result.reconstructions for left in one.unregistered}
+    no_features = {one.name: one.reason for one in result.rejected}
     names = [piece.name for piece in result.pieces]
     return RunSummary(
         output=run.root,
@@ -223,7 +237,10 @@ def _summarise(
         ),
         rejected=tuple(ImageRemark(name=one.name, reason=one.reason) for one in collection.rejected),
         unregistered=tuple(
-            ImageRemark(name=image.name, reason=why.get(index, "its segment piece was refused"))
+            ImageRemark(
+                name=image.name,
+                reason=no_features.get(image.name) or why.get(index, "its segment piece was refused"),
+            )
             for index, image in enumerate(collection.images)
             if index not in placed
         ),

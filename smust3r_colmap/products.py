@@ -213,8 +213,11 @@ class SegmentPiece:
 
     @property
     def name(self) -> str:
-        """For people, such as ``3`` or ``3b`` for the second piece of segment 3."""
-        return f"{self.segment}{'' if self.piece == 0 else chr(ord('a') + self.piece)}"
+        """For people, such as ``3``, ``3b`` for the second piece of segment 3, or ``3.27`` after ``3z``."""
+        if self.piece == 0:
+            return str(self.segment)
+        letter = chr(ord("a") + self.piece)
+        return f"{self.segment}{letter}" if letter <= "z" else f"{self.segment}.{self.piece + 1}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,12 +9,15 @@
         native.log         messages of pycolmap's native code
         import/            what was read of each file
         features/          database.db: keypoints, descriptors, matches, ids = index + 1
+        descriptors/       one vector per image
         segments/0000/     mapping/  calibrated/  depth_0/  depth_1/ ...
-        alignment/
+        alignment/         edges between the pieces
+        scene/             the fused models, before they are exported
 
 A stage is a folder. It is written aside (``NAME.partial``) and renamed, with a ``stage.json`` that
 holds the key: a hash of its inputs and settings. A folder whose key is as expected is finished and
-is read; any other is made again. Arrays are safetensors, facts are JSON, nothing is pickled.
+is read; any other is made again. What failed is not stored under the key of what was wanted, so the
+next start tries it again. Arrays are safetensors, facts are JSON, nothing is pickled.
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
@@ -56,22 +59,23 @@ class RunDirectory:
         StorageError: the disk refused.
     """
 
-    RESULTS = ("sparse", "points.ply", "scene.glb", "trajectory_tum.txt", "summary.json", "config.toml")
+    RESULTS = ("points.ply", "scene.glb", "trajectory_tum.txt", "summary.json", "config.toml")
 
     def __init__(self, root: Path, *, fresh: bool = False) -> None:
         self.root = root
         if root.exists() and not root.is_dir():
             raise RunDirectoryError(f"{root}: is a file; --output must name a folder")
-        if root.is_dir() and any(root.iterdir()) and not self.work.is_dir():
-            raise RunDirectoryError(f"{root}: is not empty and was not made by this program; name another folder")
+        lock = self.work / "lock"
+        self._lock = FileLock(lock)
         with storage_errors(root):
+            # A folder "work" alone proves nothing: `fresh` would empty somebody else's.
+            if root.is_dir() and any(root.iterdir()) and not lock.exists() and not _is_empty_folder(self.work):
+                raise RunDirectoryError(f"{root}: is not empty and was not made by this program; name another folder")
             self.work.mkdir(parents=True, exist_ok=True)
-        self._lock = FileLock(self.work / "lock")
-        try:
-            self._lock.acquire(timeout=0)
-        except Timeout:
-            raise RunLockedError(f"{root}: another process is writing here; wait for it or stop it") from None
-        with storage_errors(root):
+            try:
+                self._lock.acquire(timeout=0)
+            except Timeout:
+                raise RunLockedError(f"{root}: another process is writing here; wait for it or stop it") from None
             if fresh:
                 self._clear()
             for left_over in self.work.rglob("*.partial*"):
@@ -93,11 +97,6 @@ class RunDirectory:
         """Messages of native code in the child processes."""
         return self.work / "native.log"
 
-    @property
-    def import_records(self) -> Path:
-        """What the importer learnt of each file, so that an unchanged file is not read again."""
-        return self.work / "import" / "records.json"
-
     def stage(self, *names: str, key: str) -> StageFolder:
         """The stage at ``work/NAMES...`` that is finished only under this key."""
         return StageFolder(path=self.work.joinpath(*names), key=key)
@@ -106,10 +105,20 @@ class RunDirectory:
         """Folder of the COLMAP model number ``index``."""
         return self.root / "sparse" / str(index)
 
-    def clear_results(self) -> None:
-        """Remove the results of an earlier run, so that none of them outlives its inputs."""
-        for name in self.RESULTS:
-            _remove(self.root / name)
+    def clear_results(self, model_files: Collection[str] = ()) -> None:
+        """Remove the results of an earlier run, so that none of them outlives its inputs.
+
+        Of ``sparse`` only ``model_files``, what COLMAP models are made of; what somebody else put there stays.
+        """
+        with storage_errors(self.root):
+            for name in self.RESULTS:
+                _remove(self.root / name)
+            for path in self.root.glob("sparse/*/*"):
+                if path.parent.name.isdigit() and path.name in model_files:
+                    _remove(path)
+            for folder in self.root.glob("sparse/*"):
+                if folder.is_dir() and not any(folder.iterdir()):
+                    folder.rmdir()
 
     def _clear(self) -> None:
         self.clear_results()
@@ -179,7 +188,7 @@ def write_json(path: Path, facts: object) -> None:
 
 def read_json(path: Path) -> Any:
     """The JSON in ``path``; StorageError when it cannot be read."""
-    with storage_errors(path):
+    with storage_errors(path), _damage_named(path):
         return json.loads(path.read_text(encoding="utf-8"))
 
 
@@ -191,13 +200,13 @@ def write_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
 
 def read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
     """All arrays of a safetensors file, in memory."""
-    with storage_errors(path):
+    with storage_errors(path), _damage_named(path):
         return dict(safetensors.numpy.load_file(path))
 
 
 def read_array(path: Path, name: str) -> npt.NDArray[Any]:
     """One array of a safetensors file; the others are not read."""
-    with storage_errors(path), safetensors.safe_open(path, framework="numpy") as file:
+    with storage_errors(path), _damage_named(path), safetensors.safe_open(path, framework="numpy") as file:
         array: npt.NDArray[Any] = file.get_tensor(name)
         return array
 
@@ -211,6 +220,19 @@ def storage_errors(path: Path) -> Iterator[None]:
         raise StorageError(f"{path}: {error.strerror or error}; finished stages are kept") from error
     except safetensors.SafetensorError as error:
         raise StorageError(f"{path}: {error}; finished stages are kept") from error
+
+
+@contextmanager
+def _damage_named(path: Path) -> Iterator[None]:
+    """A finished stage that cannot be read stays so at every start: say the way out."""
+    try:
+        yield
+    except (ValueError, safetensors.SafetensorError) as error:
+        raise StorageError(f"{path}: is damaged ({error}); delete {path.parent} or start with --fresh") from error
+
+
+def _is_empty_folder(path: Path) -> bool:
+    return path.is_dir() and not any(path.iterdir())
 
 
 def _remove(path: Path) -> None:

@@ -3,6 +3,8 @@ import signal
 import time
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from smust3r_colmap.errors import StorageError
@@ -14,6 +16,8 @@ def square_unless_told_otherwise(task: int | str) -> int:
         os.kill(os.getpid(), signal.SIGKILL)
     if task == "raise":
         raise ValueError("bad value 7")
+    if task == "opencv":
+        cv2.resize(np.zeros((0, 0), np.uint8), (4, 4))
     if task == "disk":
         raise StorageError("disk full")
     assert isinstance(task, int)
@@ -44,6 +48,15 @@ def test_a_child_that_dies_costs_only_its_own_task() -> None:
 def test_an_error_becomes_a_failure_with_its_text() -> None:
     failed = outcomes([1, "raise"])[1]
     assert failed == TaskFailure(reason="ValueError: bad value 7", crashed=False)
+
+
+def test_an_error_inside_opencv_costs_only_its_task() -> None:
+    found = outcomes([1, "opencv"])
+    failed = found.pop(1)
+    assert isinstance(failed, TaskFailure)
+    assert "OpenCV" in failed.reason
+    assert not failed.crashed
+    assert found == {0: 1}
 
 
 def test_a_full_disk_ends_the_run() -> None:

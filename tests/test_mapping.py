@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,27 +12,49 @@ import pycolmap
 import pytest
 from scenes import CAMERA, make_piece, points_ahead, rotation_about_y, walk
 
+from smust3r_colmap.backbones.classical import backbone as backbone_module
+from smust3r_colmap.backbones.classical import calibration
+from smust3r_colmap.backbones.classical import features as features_module
+from smust3r_colmap.backbones.classical.backbone import ClassicalBackbone
 from smust3r_colmap.backbones.classical.calibration import (
     CalibrationTask,
     agree_on_cameras,
     calibrate_segment,
     weighted_median,
 )
+from smust3r_colmap.backbones.classical.dense import DepthTask, make_no_depth
 from smust3r_colmap.backbones.classical.descriptors import vlad_descriptors
-from smust3r_colmap.backbones.classical.features import plan_pairs
+from smust3r_colmap.backbones.classical.features import (
+    _Features,
+    _write_features,
+    match_pairs,
+    open_database,
+    plan_pairs,
+    write_images,
+)
 from smust3r_colmap.backbones.classical.mapping import (
     MappedModel,
     MappedSegment,
     MappingTask,
+    absurd_focal,
+    connected_groups,
+    diverged_focal,
     epipolar_errors_px,
+    find_hinges,
     find_jumps,
     map_segment,
     restrict_model,
 )
 from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
+from smust3r_colmap.config import ClassicalConfig
+from smust3r_colmap.errors import StorageError
+from smust3r_colmap.execution import TaskFailure, TaskResult, map_tasks
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.products import Segment, Tracks
+from smust3r_colmap.progress import QuietReporter
+from smust3r_colmap.run_directory import RunDirectory
+from smust3r_colmap.stored_maps import StoredMaps
 
 NUM_IMAGES = 8
 
@@ -126,11 +150,40 @@ def test_epipolar_errors_tell_a_true_relative_pose_from_a_folded_one() -> None:
     for k in (2, 3):
         cam_from_seg = np.linalg.inv(np.vstack([model.seg_from_cam[k], [0, 0, 0, 1]]))[:3]
         xy_img.append(CAMERA.xy_img(points @ cam_from_seg[:, :3].T + cam_from_seg[:, 3]))
-    assert epipolar_errors_px(model, 2, xy_img[0], xy_img[1]).max() < 1e-6
-    off_px = epipolar_errors_px(model, 2, xy_img[0], xy_img[1] + [0.0, 3.0])
+    assert epipolar_errors_px(model, 2, 3, xy_img[0], xy_img[1]).max() < 1e-6
+    off_px = epipolar_errors_px(model, 2, 3, xy_img[0], xy_img[1] + [0.0, 3.0])
     assert 1.0 < np.median(off_px) < 3.0
     model.seg_from_cam[3:, :, :3] = model.seg_from_cam[3:, :, :3] @ rotation_about_y(150.0)
-    assert np.median(epipolar_errors_px(model, 2, xy_img[0], xy_img[1])) > 4.0
+    assert np.median(epipolar_errors_px(model, 2, 3, xy_img[0], xy_img[1])) > 4.0
+
+
+def hinged_model(num_across: int) -> MappedModel:
+    """Two halves of three images each with forty points of their own, and some that both see."""
+    model = model_of_walk(6)
+    num_points = 80 + num_across
+    seen = [range(0, 3)] * 40 + [range(3, 6)] * 40 + [range(2, 4)] * num_across
+    return replace(
+        model,
+        tracks=Tracks(
+            points_seg=points_ahead(num_points, np.random.default_rng(0)),
+            point_of_observation=np.repeat(np.arange(num_points), [len(images) for images in seen]),
+            image_of_observation=np.concatenate([list(images) for images in seen]),
+            feature_of_observation=np.concatenate([np.full(len(images), p) for p, images in enumerate(seen)]),
+        ),
+    )
+
+
+def test_halves_that_hang_on_few_points_are_found() -> None:
+    assert find_hinges(hinged_model(11)) == [2]
+    assert find_hinges(hinged_model(12)) == []
+
+
+def test_models_that_share_four_images_hang_together() -> None:
+    whole = model_of_walk(12)
+    parts = [restrict_model(whole, list(range(a, b))) for a, b in ((0, 6), (2, 8), (7, 12))]
+    groups = connected_groups(parts)
+    assert sorted(sorted(model.images[0] for model in group) for group in groups) == [[0, 2], [7]]
+    assert len(connected_groups([*parts, restrict_model(whole, list(range(4, 11)))])) == 1
 
 
 # ------------------------------------------------------------------- pycolmap's maps
@@ -243,6 +296,24 @@ def read_only_segment(number: int, model: MappedModel) -> MappedSegment:
     return MappedSegment(segment=number, models=(model,), attempts=(), unregistered=())
 
 
+def test_one_odd_camera_of_many_does_not_condemn_a_model(
+    synthetic: tuple[MappingTask, pycolmap.Reconstruction],
+) -> None:
+    task = replace(synthetic[0], camera_indices=tuple(range(NUM_IMAGES)), cameras=synthetic[0].cameras * NUM_IMAGES)
+    model = model_of_walk(NUM_IMAGES)
+    assert diverged_focal(model, replace(task, trusted_focal={3: 900.0})) == ""
+    odd = dict.fromkeys(range(5), 900.0)
+    assert diverged_focal(model, replace(task, trusted_focal=odd)) == "focal length 500 px, the run's is 900 px"
+
+
+def test_a_focal_length_of_nonsense_is_refused_with_its_number() -> None:
+    wild = replace(CAMERA, params=(9510.0, 9510.0, 320.0, 240.0))
+    model = model_of_walk(6)
+    assert absurd_focal(model) == ""
+    assert absurd_focal(replace(model, intrinsics=(wild, *model.intrinsics[1:]))) == ""
+    assert absurd_focal(replace(model, intrinsics=(wild,) * 6)) == "focal length 9510 px is 14.9 times the longer side"
+
+
 def test_a_camera_seen_by_one_model_only_is_left_to_it() -> None:
     assert agree_on_cameras([read_only_segment(0, model_of_walk(6))], [0] * 6, [CAMERA]) == {}
 
@@ -269,6 +340,97 @@ def test_a_model_that_the_agreed_camera_does_not_fit_keeps_its_own(
     assert model.intrinsics[0].params[0] == pytest.approx(1280.0, rel=1e-3)
     assert centre_error(model, truth) < 1e-3
     assert "keep their own focal length" in calibrated.attempts[-1]
+
+
+def test_mapping_again_never_loses_sound_models(
+    synthetic: tuple[MappingTask, pycolmap.Reconstruction], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task, _ = synthetic
+    (whole,) = map_segment(task).models
+    sound = restrict_model(whole, range(4))
+    diverged = restrict_model(whole, range(4, 8))
+    focal = (replace(whole.intrinsics[0], params=(2000.0, 512.0, 384.0, 0.05)),) * 4
+    mapped = replace(read_only_segment(0, sound), models=(sound, replace(diverged, intrinsics=focal)))
+    monkeypatch.setattr(calibration, "map_segment", lambda task: replace(mapped, models=(), attempts=("in vain",)))
+    agreed = {0: whole.intrinsics[0]}
+    calibrated = calibrate_segment(CalibrationTask(mapping=task, mapped=mapped, agreed=agreed))
+    assert [model.images for model in calibrated.models] == [(0, 1, 2, 3)]
+    assert [left.image for left in calibrated.unregistered] == [4, 5, 6, 7]
+    assert "in vain" in calibrated.attempts
+
+
+# ---------------------------------------------------------------------- what failed
+def test_an_image_interrupted_between_its_two_writes_is_finished_later(tmp_path: Path) -> None:
+    features = _Features(keypoints=np.ones((5, 4), np.float32), descriptors=np.ones((5, 128), np.uint8))
+    with pycolmap.Database.open(tmp_path / "d.db") as database:
+        write_images(database, [CAMERA], [(0, 0)])
+        with pytest.raises(KeyboardInterrupt), pycolmap.DatabaseTransaction(database):
+            kind = pycolmap.FeatureExtractorType.SIFT
+            database.write_descriptors(1, pycolmap.FeatureDescriptors(kind, features.descriptors))
+            raise KeyboardInterrupt
+        assert not database.exists_keypoints(1)
+        _write_features(database, 0, features)
+        assert database.num_keypoints_for_image(1) == database.num_descriptors_for_image(1) == 5
+
+
+def open_many_times(path: Path) -> int:
+    for _ in range(100):
+        with open_database(path) as database:
+            found = int(database.num_images())
+    return found
+
+
+def test_processes_that_open_the_database_at_the_same_moment_wait_for_each_other(
+    synthetic: tuple[MappingTask, pycolmap.Reconstruction],
+) -> None:
+    results = map_tasks(open_many_times, [synthetic[0].database] * 2, workers=2)
+    assert [result.value for result in results] == [NUM_IMAGES, NUM_IMAGES]
+
+
+def test_a_file_that_is_no_database_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "database.db").write_bytes(b"garbage" * 1000)
+    monkeypatch.setattr(features_module, "_PATIENCE_S", 0.1)
+    with pytest.raises(StorageError, match=r"database\.db: cannot be opened .* --fresh"):
+        open_database(tmp_path / "database.db")
+
+
+def test_pairs_that_could_not_be_matched_are_not_reported_as_done(
+    synthetic: tuple[MappingTask, pycolmap.Reconstruction], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = synthetic[0].database
+    monkeypatch.setattr(features_module, "map_tasks", one_failure)
+    with QuietReporter(sys.stderr).stage("matching", total=2) as stage:
+        done = match_pairs(path, [(0, 1), (0, 77)], workers=1, seed=0, log_file=None, stage=stage)
+    assert done == {(0, 1)}
+
+
+def one_failure(*_: object, **__: object) -> Iterator[TaskResult[MappedSegment]]:
+    return iter([TaskResult(index=0, value=TaskFailure(reason="out of memory", crashed=True))])
+
+
+def test_a_segment_that_failed_is_tried_again_at_the_next_start(
+    synthetic: tuple[MappingTask, pycolmap.Reconstruction], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backbone = ClassicalBackbone(ClassicalConfig(), workers=1, seed=0)
+    kept = read_only_segment(0, model_of_walk(6))
+    monkeypatch.setattr(backbone_module, "map_tasks", one_failure)
+    with RunDirectory(tmp_path / "out") as run, QuietReporter(sys.stderr).stage("mapping", total=1) as stage:
+        folder = run.stage("segments", "0000", "calibrated", key="k")
+        (found,) = backbone._finish(map_segment, [synthetic[0]], [folder], [kept], run, stage)
+        assert not folder.is_done
+    assert found.models == kept.models
+    assert found.attempts == ("calibrated: out of memory",)
+
+
+def test_a_sweep_that_failed_leaves_readable_empty_maps_and_is_tried_again(tmp_path: Path) -> None:
+    piece = make_piece(walk(3), (0, 1, 2), points_ahead(9, np.random.default_rng(0)), Sim3.identity())
+    with RunDirectory(tmp_path / "out") as run:
+        folder = run.stage("segments", "0000", "depth_0", key="k")
+        make_no_depth(DepthTask(piece=piece, images=(), folder=folder, dense_size=64, planes=8))
+        assert not folder.is_done
+        maps = StoredMaps(folder.path, piece)
+        assert maps.depth(2).shape == (48, 64)
+        assert not maps.depth(2).any()
 
 
 # ---------------------------------------------------------------------- descriptors

@@ -88,7 +88,8 @@ def test_the_cloud_lies_inside_the_room_and_on_its_walls(finished: RunSummary, r
     """The room spans x -3..3, y -2..2, z 0..3 m; the cameras look level, so floor and ceiling are hardly seen."""
     estimated, truth = read_reference_sparse(finished.output / "sparse/0"), read_poses_txt(room / "poses.txt")
     fit = compare_trajectories(estimated, truth).reference_from_estimated
-    cloud = trimesh.load(finished.output / "points.ply")
+    cloud = trimesh.load(finished.output / "points.ply", process=False)
+    assert isinstance(cloud, trimesh.PointCloud)
     points = fit.apply(np.asarray(cloud.vertices))
     assert 5_000 < len(points) <= CONFIG.fusion.max_points
     beyond = np.maximum(np.array([-3.0, -2.0, 0.0]) - points, points - [3.0, 2.0, 3.0]).max(axis=1)
@@ -137,6 +138,17 @@ def test_a_changed_setting_redoes_its_stage_and_what_follows(finished: RunSummar
     assert again["alignment"]
 
 
+def test_renamed_images_have_their_new_names_in_the_model(finished: RunSummary, room: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished.output, tmp_path / "out")
+    shutil.copytree(room / "images", tmp_path / "images")
+    for path in sorted((tmp_path / "images").iterdir()):
+        path.rename(path.with_name(f"renamed_{path.name}"))
+    again = run(tmp_path / "images", tmp_path / "out")
+    names = {image.name for image in pycolmap.Reconstruction(tmp_path / "out/sparse/0").images.values()}
+    assert names == {f"renamed_{k:06d}.jpg" for k in range(NUM_IMAGES)}
+    assert reused(again)["depth"]
+
+
 KILL_AFTER = ("features: ", "matching: ", "mapping: ", "depth: ", "fusion: ")
 
 
@@ -178,6 +190,7 @@ def _copy_of_finished_stages(source: Path, output: Path, stages: list[str]) -> l
             for part in segment.glob(f"{stage}*"):
                 shutil.copytree(part, output / "work/segments" / segment.name / part.name)
     (output / "work").mkdir(parents=True, exist_ok=True)
+    (output / "work/lock").touch()
     if "features" in stages and "matching" not in stages:
         with pycolmap.Database.open(output / "work/features/database.db") as database:
             database.clear_matches()

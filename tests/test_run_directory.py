@@ -96,6 +96,20 @@ def test_a_folder_of_somebody_else_is_refused(tmp_path: Path) -> None:
     assert (tmp_path / "thesis.txt").exists()
 
 
+def test_a_work_folder_of_somebody_else_survives_fresh(tmp_path: Path) -> None:
+    (tmp_path / "work").mkdir()
+    (tmp_path / "work/thesis.txt").write_text("years of work")
+    with pytest.raises(RunDirectoryError, match="not made by this program"):
+        RunDirectory(tmp_path, fresh=True)
+    assert (tmp_path / "work/thesis.txt").exists()
+
+
+def test_a_folder_left_before_it_was_locked_is_taken(tmp_path: Path) -> None:
+    (tmp_path / "out/work").mkdir(parents=True)
+    with RunDirectory(tmp_path / "out") as run:
+        assert run.work.is_dir()
+
+
 def test_a_file_as_output_is_refused(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("")
     with pytest.raises(RunDirectoryError, match="is a file"):
@@ -147,6 +161,9 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
     (tmp_path / "x.safetensors").write_bytes(b"garbage")
     with pytest.raises(StorageError, match=r"x\.safetensors"):
         read_arrays(tmp_path / "x.safetensors")
+    (tmp_path / "half.json").write_text('{"a": ')
+    with pytest.raises(StorageError, match=r"half\.json: is damaged .*--fresh"):
+        read_json(tmp_path / "half.json")
     with pytest.raises(StorageError, match=r"absent\.json"):
         read_json(tmp_path / "absent.json")
 
@@ -156,3 +173,17 @@ def test_json_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="Out of range float"):
         write_json(tmp_path / "f.json", {"a": float("nan")})
     assert json.loads((tmp_path / "f.json").read_text()) == {"a": 1}
+
+
+def test_results_of_an_earlier_run_go_and_foreign_files_stay(tmp_path: Path) -> None:
+    with RunDirectory(tmp_path / "out") as run:
+        for number in (0, 1):
+            run.sparse_model(number).mkdir(parents=True)
+            (run.sparse_model(number) / "images.bin").write_bytes(b"old")
+        (run.sparse_model(0) / "points3D.ply").write_bytes(b"made by a trainer")
+        (run.root / "points.ply").write_bytes(b"old")
+        run.clear_results({"images.bin"})
+        assert [path.name for path in run.root.rglob("*") if path.is_file() and "work" not in path.parts] == [
+            "points3D.ply"
+        ]
+        assert not run.sparse_model(1).exists()

@@ -134,7 +134,7 @@ def _align_pair(
     except DegenerateAlignmentError as error:
         yield TriedAlignment(target=target, source=source, evidence="links", reason=str(error))
         return
-    yield _edge(target, source, fit, "links", _refusal_of_links(fit))
+    yield _edge(target, source, fit, "links", _refusal_of_links(a, b, fit))
 
 
 def _evidence(a: SegmentPiece, b: SegmentPiece, settings: AlignmentConfig) -> str:
@@ -184,18 +184,25 @@ def _refusal(a: SegmentPiece, b: SegmentPiece, fit: PieceFit) -> str:
         return f"median residual is {fit.relative_residual:.3f} of the depth, at most {MAX_RELATIVE_RESIDUAL}"
     if fit.num_correspondences < MIN_SHARED_TRACKS:
         return f"{fit.num_correspondences} common points, needed {MIN_SHARED_TRACKS}"
+    return _camera_refusal(a, b, fit)
+
+
+def _camera_refusal(a: SegmentPiece, b: SegmentPiece, fit: PieceFit) -> str:
+    if not set(a.images) & set(b.images):
+        return ""
     turn_deg = camera_turn_deg(a, b, fit)
     if turn_deg > MAX_CAMERA_TURN_DEG:
         return f"shared cameras differ by {turn_deg:.1f} degrees after the fit, at most {MAX_CAMERA_TURN_DEG}"
     return ""
 
 
-def _refusal_of_links(fit: PieceFit) -> str:
+def _refusal_of_links(a: SegmentPiece, b: SegmentPiece, fit: PieceFit) -> str:
+    """The same for an edge from matches; cameras that are shared all the same have to agree."""
     if fit.estimate.num_inliers < MIN_LINK_INLIERS:
         return f"{fit.estimate.num_inliers} matched points fit, needed {MIN_LINK_INLIERS}"
     if fit.inlier_share < MIN_LINK_SHARE:
         return f"{fit.inlier_share:.0%} of the matched points fit, needed {MIN_LINK_SHARE:.0%}"
-    return ""
+    return _camera_refusal(a, b, fit)
 
 
 def camera_turn_deg(a: SegmentPiece, b: SegmentPiece, fit: PieceFit) -> float:

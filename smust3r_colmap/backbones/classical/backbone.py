@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
-import pycolmap
 
 from smust3r_colmap.backbones.base import BackboneResult
 from smust3r_colmap.backbones.classical.calibration import CalibrationTask, agree_on_cameras, calibrate_segment
@@ -20,6 +20,7 @@ from smust3r_colmap.backbones.classical.features import (
     create_database,
     extract_features,
     match_pairs,
+    open_database,
     plan_pairs,
 )
 from smust3r_colmap.backbones.classical.mapping import MappedSegment, MappingTask, map_segment
@@ -35,7 +36,7 @@ from smust3r_colmap.products import (
     SegmentReconstruction,
     UnregisteredImage,
 )
-from smust3r_colmap.progress import Reporter
+from smust3r_colmap.progress import Reporter, Stage
 from smust3r_colmap.run_directory import RunDirectory, StageFolder, key_of, read_arrays, write_arrays
 from smust3r_colmap.stored_maps import StoredMaps
 
@@ -65,11 +66,13 @@ class ClassicalBackbone:
         self, collection: ImageCollection, segments: Sequence[Segment], run: RunDirectory, reporter: Reporter
     ) -> BackboneResult:
         """All segments of the run; see ``Backbone``."""
-        pairs = {segment.index: self._pairs(segment) for segment in segments}
         features = self._features_stage(collection, run)
         database = features.open_in_place() / "database.db"
-        rejected = self._extract_and_match(database, collection, pairs.values(), run, reporter)
-        descriptors = self._descriptors(database, len(collection), run, features.key)
+        rejected = self._extract(database, collection, run, reporter)
+        lost = {image.name for image in rejected}
+        usable = [image.name not in lost for image in collection.images]
+        pairs = self._match(database, segments, usable, run, reporter)
+        descriptors = self._descriptors(database, usable, run, features.key)
         tasks = [self._mapping_task(segment, pairs[segment.index], database, collection) for segment in segments]
         mapped = self._map(tasks, collection, run, features.key, reporter)
         reconstructions = [_reconstruction(one, descriptors) for one in mapped]
@@ -95,13 +98,8 @@ class ClassicalBackbone:
         )
         return run.stage("features", key=key)
 
-    def _extract_and_match(
-        self,
-        database: Path,
-        collection: ImageCollection,
-        pairs: Iterable[Sequence[Pair]],
-        run: RunDirectory,
-        reporter: Reporter,
+    def _extract(
+        self, database: Path, collection: ImageCollection, run: RunDirectory, reporter: Reporter
     ) -> tuple[RejectedImage, ...]:
         create_database(database, collection)
         with reporter.stage("features", total=len(collection)) as stage:
@@ -114,21 +112,32 @@ class ClassicalBackbone:
                 log_file=run.native_log,
                 stage=stage,
             )
-        every_pair = {pair for some in pairs for pair in some}
-        with reporter.stage("matching", total=len(every_pair)) as stage:
-            match_pairs(
-                database, every_pair, workers=self.workers, seed=self.seed, log_file=run.native_log, stage=stage
-            )
+        for image in rejected:
+            reporter.warn(f"no features: {image.name} ({image.reason})")
         return rejected
 
+    def _match(
+        self, database: Path, segments: Sequence[Segment], usable: Sequence[bool], run: RunDirectory, reporter: Reporter
+    ) -> dict[int, tuple[Pair, ...]]:
+        """The matched pairs by segment. Pairs that failed are in no key, so what comes later is not final either."""
+        plan = {
+            segment.index: [(a, b) for a, b in self._pairs(segment) if usable[a] and usable[b]] for segment in segments
+        }
+        every_pair = {pair for pairs in plan.values() for pair in pairs}
+        with reporter.stage("matching", total=len(every_pair)) as stage:
+            matched = match_pairs(
+                database, every_pair, workers=self.workers, seed=self.seed, log_file=run.native_log, stage=stage
+            )
+        return {index: tuple(pair for pair in pairs if pair in matched) for index, pairs in plan.items()}
+
     def _descriptors(
-        self, database: Path, num_images: int, run: RunDirectory, features_key: str
+        self, database: Path, usable: Sequence[bool], run: RunDirectory, features_key: str
     ) -> npt.NDArray[np.float32]:
         """(N, D) descriptors of all images, made once."""
-        stage = run.stage("descriptors", key=key_of("descriptors", features_key, self.seed))
+        stage = run.stage("descriptors", key=key_of("descriptors", features_key, usable, self.seed))
         if not stage.is_done:
-            with pycolmap.Database.open(database) as opened:
-                sift = [np.asarray(opened.read_descriptors(i + 1).data).reshape(-1, 128) for i in range(num_images)]
+            with open_database(database) as opened:
+                sift = [np.asarray(opened.read_descriptors(i + 1).data).reshape(-1, 128) for i in range(len(usable))]
             made = vlad_descriptors(sift, rng=np.random.default_rng(self.seed))
             with stage.write() as folder:
                 write_arrays(folder / "descriptors.safetensors", {"vlad": made})
@@ -162,42 +171,58 @@ class ClassicalBackbone:
         keys = [key_of("mapping", features_key, task.images, task.pairs, self.seed) for task in tasks]
         folders = [_segment_stage(run, task.segment, "mapping", key) for task, key in zip(tasks, keys, strict=True)]
         with reporter.stage("mapping", total=len(tasks)) as stage:
-            mapped = self._finish(map_segment, tasks, folders, tasks, run, stage.skip, stage.advance)
+            mapped = self._finish(map_segment, tasks, folders, [_nothing(task) for task in tasks], run, stage)
+        crashed = [k for k, one in enumerate(mapped) if not one.models and not folders[k].is_done]
+        if crashed:
+            with reporter.stage("mapping without the global mapper", total=len(crashed)) as stage:
+                careful = [replace(tasks[k], use_global=False) for k in crashed]
+                again = self._finish(
+                    map_segment, careful, [folders[k] for k in crashed], [mapped[k] for k in crashed], run, stage
+                )
+            for k, one in zip(crashed, again, strict=True):
+                mapped[k] = one
         agreed = agree_on_cameras(mapped, [image.camera for image in collection.images], collection.cameras)
         for camera, intrinsics in agreed.items():
             reporter.note(f"camera {camera + 1}: the segments agree on a focal length of {intrinsics.focal_px:.1f} px")
-        keys = [key_of("calibrated", key, sorted(agreed.items())) for key in keys]
-        folders = [_segment_stage(run, task.segment, "calibrated", key) for task, key in zip(tasks, keys, strict=True)]
-        calibrations = [
-            CalibrationTask(mapping=task, mapped=one, agreed=agreed) for task, one in zip(tasks, mapped, strict=True)
+        chosen = [k for k, one in enumerate(mapped) if one.models]
+        keys = [key_of("calibrated", keys[k], sorted(agreed.items())) for k in chosen]
+        folders = [
+            _segment_stage(run, mapped[k].segment, "calibrated", key) for k, key in zip(chosen, keys, strict=True)
         ]
-        with reporter.stage("calibration", total=len(tasks)) as stage:
-            return self._finish(calibrate_segment, calibrations, folders, tasks, run, stage.skip, stage.advance)
+        calibrations = [CalibrationTask(mapping=tasks[k], mapped=mapped[k], agreed=agreed) for k in chosen]
+        with reporter.stage("calibration", total=len(chosen)) as stage:
+            calibrated = self._finish(calibrate_segment, calibrations, folders, [mapped[k] for k in chosen], run, stage)
+        for k, one in zip(chosen, calibrated, strict=True):
+            mapped[k] = one
+        return mapped
 
     def _finish(
         self,
         function: Callable[[TaskT], MappedSegment],
         tasks: Sequence[TaskT],
         folders: Sequence[StageFolder],
-        mapping: Sequence[MappingTask],
+        otherwise: Sequence[MappedSegment],
         run: RunDirectory,
-        skip: Callable[[int], None],
-        advance: Callable[[int], None],
+        stage: Stage,
     ) -> list[MappedSegment]:
-        """Run what no earlier start finished, store it, and return everything in order."""
+        """Run what no earlier start finished, store it, and return everything in order.
+
+        A task that failed gives what ``otherwise`` has for it, which is not stored: the next start, with
+        fewer workers or more disk, may get farther.
+        """
         missing = [k for k, folder in enumerate(folders) if not folder.is_done]
-        skip(len(tasks) - len(missing))
-        chosen = [tasks[k] for k in missing]
-        for result in map_tasks(function, chosen, workers=self.workers, log_file=run.native_log):
+        stage.skip(len(tasks) - len(missing))
+        failed = {}
+        for result in map_tasks(function, [tasks[k] for k in missing], workers=self.workers, log_file=run.native_log):
             k = missing[result.index]
-            value = result.value
-            if isinstance(value, TaskFailure):
-                logger.warning("segment %d gave nothing: %s", mapping[k].segment, value.reason)
-                value = _nothing(mapping[k], value.reason)
-            with folders[k].write() as folder:
-                write_mapped(folder, value)
-            advance(1)
-        return [read_mapped(folder.path) for folder in folders]
+            if isinstance(result.value, TaskFailure):
+                failed[k] = _with_failure(otherwise[k], folders[k].path.name, result.value)
+                logger.warning("segment %d, %s", failed[k].segment, failed[k].attempts[-1])
+            else:
+                with folders[k].write() as folder:
+                    write_mapped(folder, result.value)
+            stage.advance()
+        return [failed[k] if k in failed else read_mapped(folder.path) for k, folder in enumerate(folders)]
 
     def _dense(
         self, pieces: Sequence[SegmentPiece], collection: ImageCollection, run: RunDirectory, reporter: Reporter
@@ -230,20 +255,25 @@ class ClassicalBackbone:
                     make_no_depth(task)
                 stage.advance(len(task.images))
         maps = tuple(StoredMaps(task.folder.path, task.piece) for task in tasks)
-        return maps, key_of([task.folder.key for task in tasks])
+        return maps, key_of([(task.folder.key, task.folder.is_done) for task in tasks])
 
 
 def _segment_stage(run: RunDirectory, segment: int, name: str, key: str) -> StageFolder:
     return run.stage("segments", f"{segment:04d}", name, key=key)
 
 
-def _nothing(task: MappingTask, reason: str) -> MappedSegment:
+def _nothing(task: MappingTask) -> MappedSegment:
+    reason = f"the mapping of segment {task.segment} failed"
     return MappedSegment(
         segment=task.segment,
         models=(),
-        attempts=(reason,),
+        attempts=(),
         unregistered=tuple(UnregisteredImage(image=image, reason=reason) for image in task.images),
     )
+
+
+def _with_failure(mapped: MappedSegment, stage: str, failure: TaskFailure) -> MappedSegment:
+    return replace(mapped, attempts=(*mapped.attempts, f"{stage}: {failure.reason}"))
 
 
 def _reconstruction(mapped: MappedSegment, descriptors: npt.NDArray[np.float32]) -> SegmentReconstruction:
@@ -273,7 +303,7 @@ def _reconstruction(mapped: MappedSegment, descriptors: npt.NDArray[np.float32])
 def _read_links(database: Path, pairs: Sequence[Pair]) -> FeatureLinks:
     """The verified matches of all pairs of the plan."""
     columns: list[list[npt.NDArray[np.int64]]] = [[], [], [], []]
-    with pycolmap.Database.open(database) as opened:
+    with open_database(database) as opened:
         for first, second in pairs:
             matches = np.asarray(
                 opened.read_two_view_geometry(first + 1, second + 1).inlier_matches, dtype=np.int64

@@ -17,13 +17,13 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from smust3r_colmap.backbones.classical.features import internal_name
+from smust3r_colmap.backbones.classical.features import internal_name, open_database
 from smust3r_colmap.backbones.classical.mapping import (
     ENOUGH_REGISTERED,
-    FOCAL_TOLERANCE,
     MappedModel,
     MappedSegment,
     MappingTask,
+    diverged_focal,
     map_segment,
     model_from_reconstruction,
 )
@@ -87,19 +87,25 @@ def weighted_median(values: npt.NDArray[np.float64], weights: npt.NDArray[np.flo
 
 
 def calibrate_segment(task: CalibrationTask) -> MappedSegment:
-    """Map again what diverged, then adjust every model with the agreed cameras held fixed."""
+    """Map again what diverged, then adjust every model with the agreed cameras held fixed.
+
+    The new models replace all old ones, unless they place fewer images than the sound ones among the old.
+    """
     mapped = task.mapped
     trusted = {camera: intrinsics.focal_px for camera, intrinsics in task.agreed.items()}
-    sound = [model for model in mapped.models if not _diverged(model, task.mapping, trusted)]
+    mapping = replace(task.mapping, trusted_focal=trusted)
+    sound = [model for model in mapped.models if not diverged_focal(model, mapping)]
     placed = {image for model in sound for image in model.images}
     if len(placed) >= ENOUGH_REGISTERED * len(task.mapping.images):
         mapped = replace(mapped, models=tuple(sound), unregistered=left_over(task.mapping, sound, mapped.unregistered))
     elif len(sound) < len(mapped.models):
         start = tuple(task.agreed.get(index, camera) for index, camera in enumerate(task.mapping.cameras))
-        again = map_segment(replace(task.mapping, cameras=start, trusted_focal=trusted))
-        mapped = replace(
-            again, attempts=(*mapped.attempts, "focal length off the run's: mapped again", *again.attempts)
-        )
+        again = map_segment(replace(mapping, cameras=start))
+        attempts = (*mapped.attempts, "focal length off the run's: mapped again", *again.attempts)
+        if len({image for model in again.models for image in model.images}) < len(placed):
+            left = left_over(task.mapping, sound, again.unregistered)
+            again = replace(again, models=tuple(sound), unregistered=left)
+        mapped = replace(again, attempts=attempts)
     models = []
     notes = []
     for model in mapped.models:
@@ -120,15 +126,6 @@ def left_over(
         for image in task.images
         if image not in placed
     )
-
-
-def _diverged(model: MappedModel, mapping: MappingTask, trusted: Mapping[int, float]) -> bool:
-    camera_of = dict(zip(mapping.images, mapping.camera_indices, strict=True))
-    for image, intrinsics in zip(model.images, model.intrinsics, strict=True):
-        focal = trusted.get(camera_of[image])
-        if focal and abs(np.log(intrinsics.focal_px / focal)) > np.log1p(FOCAL_TOLERANCE):
-            return True
-    return False
 
 
 def _adjust(model: MappedModel, task: CalibrationTask) -> tuple[MappedModel, str]:
@@ -166,7 +163,7 @@ def reconstruction_from_model(model: MappedModel, task: CalibrationTask) -> pyco
     for camera in sorted({camera_of[image] for image in model.images}):
         own = next(i for image, i in zip(model.images, model.intrinsics, strict=True) if camera_of[image] == camera)
         reconstruction.add_camera_with_trivial_rig(task.agreed.get(camera, own).colmap_camera(camera + 1))
-    with pycolmap.Database.open(mapping.database) as database:
+    with open_database(mapping.database) as database:
         for k, index in enumerate(model.images):
             image = pycolmap.Image(name=internal_name(index), camera_id=camera_of[index] + 1, image_id=index + 1)
             xy_img = np.asarray(database.read_keypoints(index + 1), dtype=np.float64)[:, :2]

@@ -9,7 +9,7 @@ import numpy as np
 from smust3r_colmap.backbones.classical.plane_sweep import ColourImage, reconstruct_depth
 from smust3r_colmap.importers.images import load_rgb
 from smust3r_colmap.products import SegmentPiece, SourceImage
-from smust3r_colmap.run_directory import StageFolder
+from smust3r_colmap.run_directory import StageFolder, key_of
 from smust3r_colmap.stored_maps import ImageMaps, write_maps
 
 
@@ -52,7 +52,7 @@ def make_depth(task: DepthTask) -> None:
 
 
 def make_no_depth(task: DepthTask) -> None:
-    """Finish the stage with empty maps, for a piece whose sweep failed."""
+    """Write empty maps for a piece whose sweep failed, under another key: the next start sweeps again."""
     maps = []
     for intrinsics in task.piece.intrinsics:
         shrink = min(1.0, task.dense_size / max(intrinsics.width, intrinsics.height))
@@ -64,5 +64,5 @@ def make_no_depth(task: DepthTask) -> None:
                 rgb=np.zeros((*shape, 3), np.uint8),
             )
         )
-    with task.folder.write() as folder:
+    with StageFolder(path=task.folder.path, key=key_of(task.folder.key, "no depth")).write() as folder:
         write_maps(folder, maps)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import tempfile
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from smust3r_colmap.errors import StorageError
 from smust3r_colmap.execution import TaskFailure, map_tasks
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.images import load_grey
@@ -30,6 +32,8 @@ logger = logging.getLogger(__name__)
 Pair = tuple[int, int]
 
 _PAIRS_PER_THREAD = 100
+_PATIENCE_S = 30.0
+_PAUSE_S = 0.02
 _SPARSE_PEAK_THRESHOLD = 0.002
 """Second try for images that gave fewer than a quarter of the features allowed (COLMAP's own is 0.0067)."""
 
@@ -55,10 +59,32 @@ class _MatchingTask:
     seed: int
 
 
+def open_database(path: Path) -> pycolmap.Database:
+    """The run's database, which several processes may open at the same moment.
+
+    pycolmap writes when it opens and does not wait for a lock: with two processes one opening in sixty
+    fails with "database is locked". So it is tried again.
+
+    Raises:
+        StorageError: it cannot be opened for ``_PATIENCE_S`` seconds, or is no database.
+    """
+    give_up_s = time.monotonic() + _PATIENCE_S
+    while True:
+        try:
+            return pycolmap.Database.open(path)
+        except RuntimeError as error:
+            if time.monotonic() > give_up_s:
+                raise StorageError(
+                    f"{path}: cannot be opened for {_PATIENCE_S:.0f} s ({error}); is it held by another process, or "
+                    f"damaged? Delete {path.parent} or start with --fresh"
+                ) from error
+            time.sleep(_PAUSE_S)
+
+
 def create_database(path: Path, collection: ImageCollection) -> None:
     """Write cameras, rigs, frames and images with our ids, unless the database has them already."""
-    with pycolmap.Database.open(path) as database:
-        if database.num_images() == len(collection):
+    with open_database(path) as database:
+        if database.num_frames() == len(collection):  # an image's frame is written last
             return
         database.clear_all_tables()
         with pycolmap.DatabaseTransaction(database):
@@ -103,10 +129,11 @@ def extract_features(
     """Extract SIFT for every image that has no keypoints yet; returns the images that failed.
 
     Keypoints are in pixels of the original image (first pixel centre at 0.5), whatever
-    ``max_image_size`` they were found at. An image that fails gets zero keypoints.
+    ``max_image_size`` they were found at. An image that fails gets none and is tried again at the
+    next start.
     """
     failed = []
-    with pycolmap.Database.open(path) as database:
+    with open_database(path) as database:
         missing = [i for i in range(len(collection)) if not database.exists_keypoints(i + 1)]
         stage.skip(len(collection) - len(missing))
         tasks = [
@@ -118,14 +145,23 @@ def extract_features(
             features = result.value
             if isinstance(features, TaskFailure):
                 failed.append(RejectedImage(name=collection.images[index].name, reason=f"SIFT: {features.reason}"))
-                features = _Features(keypoints=np.zeros((0, 4), np.float32), descriptors=np.zeros((0, 128), np.uint8))
-            with pycolmap.DatabaseTransaction(database):
-                database.write_descriptors(
-                    index + 1, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, features.descriptors)
-                )
-                database.write_keypoints(index + 1, features.keypoints)
+            else:
+                _write_features(database, index, features)
             stage.advance()
     return tuple(failed)
+
+
+def _write_features(database: pycolmap.Database, index: int, features: _Features) -> None:
+    """Descriptors, then keypoints, which say that the image is done.
+
+    pycolmap commits a transaction that Ctrl-C leaves, so the descriptors may be there already.
+    """
+    with pycolmap.DatabaseTransaction(database):
+        if not database.exists_descriptors(index + 1):
+            database.write_descriptors(
+                index + 1, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, features.descriptors)
+            )
+        database.write_keypoints(index + 1, features.keypoints)
 
 
 def _extract(task: _ExtractionTask) -> _Features:
@@ -181,13 +217,16 @@ def match_pairs(
     seed: int,
     log_file: Path | None,
     stage: Stage,
-) -> None:
+) -> frozenset[Pair]:
     """Match and verify every pair that is not in the database yet; each pair once in the run.
 
     pycolmap writes a pair when it is finished, also one without a match, so what is there is done.
+
+    Returns:
+        The pairs that are done; the others failed and are tried again at the next start.
     """
     wanted = sorted(set(pairs))
-    with pycolmap.Database.open(path) as database:
+    with open_database(path) as database:
         missing = [pair for pair in wanted if not database.exists_matches(pair[0] + 1, pair[1] + 1)]
     stage.skip(len(wanted) - len(missing))
     size = _PAIRS_PER_THREAD * workers
@@ -198,8 +237,10 @@ def match_pairs(
     # One child with threads, not many children: SQLite takes one writer at a time.
     for result in map_tasks(_match, tasks, workers=1, log_file=log_file):
         if isinstance(result.value, TaskFailure):
-            logger.warning("%d pairs were not matched: %s", len(tasks[result.index].pairs), result.value.reason)
+            logger.warning("up to %d pairs not matched: %s", len(tasks[result.index].pairs), result.value.reason)
         stage.advance(len(tasks[result.index].pairs))
+    with open_database(path) as database:
+        return frozenset(pair for pair in wanted if database.exists_matches(pair[0] + 1, pair[1] + 1))
 
 
 def _match(task: _MatchingTask) -> None:

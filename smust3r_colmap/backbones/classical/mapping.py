@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from smust3r_colmap.backbones.classical.features import Pair, write_images
+from smust3r_colmap.backbones.classical.features import Pair, open_database, write_images
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import Tracks, UnregisteredImage
@@ -28,9 +28,11 @@ from smust3r_colmap.products import Tracks, UnregisteredImage
 logger = logging.getLogger(__name__)
 
 ENOUGH_REGISTERED = 0.9
-"""Share of a segment's images in one model at which the ladder stops."""
+"""Share of a segment's images in sound models at which the ladder stops."""
 MIN_PIECE_IMAGES = 4
 """Smaller models are too weak to be a node; a segment that is itself smaller may still be one."""
+MIN_SHARED_IMAGES = 4
+"""Common images that can join two models by a similarity with something left over to check it."""
 MAX_TURN_DEG = 60.0
 """Neighbouring images that match cannot have turned by more (honest walks: 52 at most; folds: 150)."""
 MAX_STEP_RATIO = 10.0
@@ -40,7 +42,12 @@ MIN_JUMP_DEPTHS = 0.5
 MIN_PAIR_INLIERS = 15
 """Verified matches below which COLMAP does not use a pair."""
 MIN_EXPLAINED_SHARE = 0.5
-"""A relative pose that fewer of the pair's verified matches agree with is a fold."""
+"""A relative pose that fewer of the pair's verified matches agree with is wrong (sound models: 0.57 at
+least; wrong ones, on a walk round a building: 0 to 0.44)."""
+MIN_HINGE_POINTS = 12
+"""Common points that hold two halves of a model together (honest links: 16 at least; a wrong one: 9)."""
+NEAR_STEPS = 2
+"""How far apart in order two images may be to deny each other; farther ones may be look-alikes."""
 MAX_EPIPOLAR_ERROR_PX = 4.0
 """COLMAP's own bound for an inlier of two views."""
 STRONG_PAIR_INLIERS = 30
@@ -60,10 +67,11 @@ class MappingTask:
 
     Args:
         segment: its index. database: the run's. images: indices in order, with their cameras.
-        pairs: which of the database's pairs may be used.
+        pairs: which of the database's pairs may be used; all of them have been matched.
         cameras: start values by camera index.
         trusted_focal: the run's consensus focal length by camera index, empty in the first pass.
         seed: of pycolmap's samplers.
+        use_global: the last rung may be climbed; not after it brought the process down.
     """
 
     segment: int
@@ -74,6 +82,7 @@ class MappingTask:
     cameras: tuple[Intrinsics, ...]
     trusted_focal: Mapping[int, float]
     seed: int
+    use_global: bool = True
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -122,6 +131,7 @@ class _Ladder:
         self.attempts: list[str] = []
         self.candidates: list[tuple[MappedModel, ...]] = []
         self.largest_output: Path | None = None
+        self.mapped: dict[str, dict[int, pycolmap.Reconstruction]] = {}
         self.min_images = min(MIN_PIECE_IMAGES, len(task.images))
         self.inliers = self._build_database("segment.db", task.pairs)
 
@@ -139,25 +149,32 @@ class _Ladder:
         if self._enough():
             return
         self._attempt("incremental, relaxed start", self._incremental("segment.db", relaxed=True))
-        if self._enough():
-            return
-        self._attempt("global", self._global())
+        if not self._enough() and self.task.use_global:
+            self._attempt("global", self._global())
 
     def best_models(self) -> tuple[MappedModel, ...]:
-        """Models of the attempt that placed most images in one, then what others add to it."""
+        """Models of the attempt that placed most images, then what others add to it, then bridges.
+
+        Several sound models that overlap serve better than one that a weak link holds together: the
+        neighbouring segments join them again. So images count, not the size of the largest model.
+        """
         if not self.candidates:
             return ()
-        # Earlier rungs are stricter: a later one has to place clearly more images in its largest model.
+        # Earlier rungs are stricter: a later one has to place clearly more images.
         best = self.candidates[0]
         for models in self.candidates[1:]:
-            if len(models[0].images) > 1.05 * len(best[0].images):
+            if len(_placed(models)) > 1.05 * len(_placed(best)):
                 best = models
-        chosen = list(best)
+        chosen: list[MappedModel] = []
+        for models, share_of_new in [(best, 0.1), *[(models, 0.3) for models in self.candidates]]:
+            for model in models:
+                new = set(model.images) - _placed(chosen)
+                if len(new) >= max(2, share_of_new * len(model.images)):
+                    chosen.append(model)
         for models in self.candidates:
             for model in models:
-                placed = {image for kept in chosen for image in kept.images}
-                if len(set(model.images) - placed) >= max(2, len(model.images) // 3):
-                    chosen.append(model)
+                if sum(_share_images(model, group) for group in connected_groups(chosen)) >= 2:
+                    chosen.append(model)  # a bridge
         return tuple(sorted(chosen, key=lambda model: -len(model.images)))
 
     def why_not(self, image: int, placed: set[int]) -> str:
@@ -185,15 +202,23 @@ class _Ladder:
                 f"{self._count_jumps(second)} from a relaxed start; {'the second' if better else 'the first'} is kept"
             )
             found = second if better else found
-        folds = sum(len(self._folds(model)) for model in found)
-        if folds:
+        denied = sum(len(self._denied_steps(model)) for model in found)
+        hinges = sum(len(find_hinges(model)) for model in found)
+        if denied or hinges:
             self.attempts.append(
-                f"{name}: {folds} jumps that the matches deny; once more with near pairs only, then cut"
+                f"{name}: cut at {denied} steps that the matches deny and {hinges} that hang on few points"
             )
-            near = tuple(pair for pair in self.task.pairs if self._offset(pair) <= NEAR_OFFSET)
-            self._build_database("near.db", near)
-            again = self._convert(self._incremental("near.db", relaxed=True), f"{name}, near pairs")
-            found = [part for model in again for part in self._cut(model)]
+            found = [part for model in found for part in self._cut(model)]
+        if denied:
+            self.largest_output = None
+            if name == "incremental":
+                near = tuple(pair for pair in self.task.pairs if self._offset(pair) <= NEAR_OFFSET)
+                self._build_database("near.db", near)
+                again = self._convert(self._incremental("near.db", relaxed=False), f"{name}, near pairs")
+                parts = [part for model in again for part in self._cut(model)]
+                if len(_placed(parts)) >= len(_placed(found)):
+                    self.attempts.append(f"{name}: mapped again with near pairs only")
+                    found = parts
         accepted = []
         for model in sorted(found, key=lambda model: -len(model.images)):
             problem = self._problem(model)
@@ -207,8 +232,11 @@ class _Ladder:
             self.candidates.append(tuple(accepted))
 
     def _enough(self) -> bool:
-        most = max((len(models[0].images) for models in self.candidates), default=0)
-        return most >= ENOUGH_REGISTERED * len(self.task.images)
+        """Some attempt placed nearly all images, in models that hang together."""
+        return any(
+            len(_placed(models)) >= ENOUGH_REGISTERED * len(self.task.images) and len(connected_groups(models)) == 1
+            for models in self.candidates
+        )
 
     def _incremental(
         self, database: str, *, relaxed: bool, start: Path | None = None
@@ -235,11 +263,14 @@ class _Ladder:
             options.mapper.init_min_tri_angle = 2.0
         name = "incremental" if not relaxed else ("continued" if start else "relaxed")
         output = self.scratch / (name if database == "segment.db" else f"{name}-near")
-        output.mkdir(exist_ok=True)
+        if output.name in self.mapped:  # a second opinion and a later rung may ask the same
+            return self.mapped[output.name]
+        output.mkdir()
         models: dict[int, pycolmap.Reconstruction] = pycolmap.incremental_mapping(
             self.scratch / database, self.scratch, output, options, input_path=start or ""
         )
-        if not relaxed and models:
+        self.mapped[output.name] = models
+        if database == "segment.db" and not relaxed and models:
             largest = max(models, key=lambda number: models[number].num_reg_images())
             self.largest_output = output / str(largest)
         return models
@@ -265,45 +296,35 @@ class _Ladder:
         """Why a model cannot be believed, or nothing. Its pixels look perfect in every such case."""
         if not np.isfinite(model.reprojection_error_px) or model.reprojection_error_px > 3.0:
             return f"mean reprojection error {model.reprojection_error_px:.2f} px"
-        for intrinsics in set(model.intrinsics):
-            ratio = intrinsics.focal_px / max(intrinsics.width, intrinsics.height)
-            if not MIN_FOCAL_RATIO <= ratio <= MAX_FOCAL_RATIO:
-                return f"focal length {intrinsics.focal_px:.0f} px is {ratio:.1f} times the longer side"
-        camera_of = dict(zip(self.task.images, self.task.camera_indices, strict=True))
-        for image, intrinsics in zip(model.images, model.intrinsics, strict=True):
-            trusted = self.task.trusted_focal.get(camera_of[image])
-            if trusted and abs(np.log(intrinsics.focal_px / trusted)) > np.log1p(FOCAL_TOLERANCE):
-                return f"focal length {intrinsics.focal_px:.0f} px, the run's is {trusted:.0f} px"
-        return ""
+        return absurd_focal(model) or diverged_focal(model, self.task)
 
     def _count_jumps(self, models: Sequence[MappedModel]) -> int:
         return sum(len(find_jumps(model, self.task.images, self.inliers)) for model in models)
 
-    def _folds(self, model: MappedModel) -> list[int]:
-        """Jumps that the matches of the two images deny: the model laid one place onto another.
+    def _denied_steps(self, model: MappedModel) -> list[int]:
+        """Positions k such that the matches deny how the model places image k and the next.
 
-        A drone that turns at the end of a strip jumps too, but there the matches agree.
+        Every pair of near images with STRONG_PAIR_INLIERS has to find most of its verified matches on
+        their epipolar lines. That tells a fold, or a bad bridge, from a drone's half turn at the end
+        of a strip, where the model turns as well but the matches agree.
         """
-        return [
-            k
-            for k in find_jumps(model, self.task.images, self.inliers)
-            if self._explained_share(model, k) < MIN_EXPLAINED_SHARE
-        ]
-
-    def _explained_share(self, model: MappedModel, k: int) -> float:
-        """Share of the verified matches of image k and the next that fit the model's relative pose."""
-        first, second = model.images[k], model.images[k + 1]
-        with pycolmap.Database.open(self.task.database) as database:
-            matches = database.read_two_view_geometry(first + 1, second + 1).inlier_matches
-            xy_img = [np.asarray(database.read_keypoints(i + 1), dtype=np.float64)[:, :2] for i in (first, second)]
-        errors_px = epipolar_errors_px(model, k, xy_img[0][matches[:, 0]], xy_img[1][matches[:, 1]])
-        return float(np.mean(errors_px < MAX_EPIPOLAR_ERROR_PX))
+        order = {image: place for place, image in enumerate(self.task.images)}
+        denied = set()
+        with open_database(self.task.database) as database:
+            for a, b in near_positions(model.images, order):
+                first, second = model.images[a], model.images[b]
+                if self.inliers.get((first, second), 0) >= STRONG_PAIR_INLIERS:
+                    share = explained_share(model, a, b, database)
+                    if share < MIN_EXPLAINED_SHARE:
+                        denied.add(b - 1)
+        return sorted(denied)
 
     def _cut(self, model: MappedModel) -> list[MappedModel]:
-        """The model without folds: its parts between them, those that are large enough."""
-        bounds = [0, *[k + 1 for k in self._folds(model)], len(model.images)]
+        """The model without denied steps and hinges: its parts between them, those that are large enough."""
+        breaks = sorted({*self._denied_steps(model), *find_hinges(model)})
+        bounds = [0, *[k + 1 for k in breaks], len(model.images)]
         parts = [range(a, b) for a, b in pairwise(bounds) if b - a >= self.min_images]
-        return [restrict_model(model, part) for part in parts]
+        return [model] if len(bounds) == 2 else [restrict_model(model, part) for part in parts]
 
     # ------------------------------------------------------------------- plumbing
     def _offset(self, pair: Pair) -> int:
@@ -315,13 +336,14 @@ class _Ladder:
         path = self.scratch / name
         path.unlink(missing_ok=True)
         with (
-            pycolmap.Database.open(self.task.database) as run,
+            open_database(self.task.database) as run,
             pycolmap.Database.open(path) as own,
             pycolmap.DatabaseTransaction(own),
         ):
             write_images(own, self.task.cameras, zip(self.task.images, self.task.camera_indices, strict=True))
             for image in self.task.images:
-                own.write_keypoints(image + 1, run.read_keypoints(image + 1))
+                if run.exists_keypoints(image + 1):
+                    own.write_keypoints(image + 1, run.read_keypoints(image + 1))
             for first, second in pairs:
                 geometry = run.read_two_view_geometry(first + 1, second + 1)
                 inliers[first, second] = len(geometry.inlier_matches)
@@ -333,6 +355,28 @@ class _Ladder:
     def _convert(self, models: dict[int, pycolmap.Reconstruction], method: str) -> list[MappedModel]:
         converted = [model_from_reconstruction(model, method) for model in models.values()]
         return [model for model in converted if len(model.images) >= self.min_images]
+
+
+def absurd_focal(model: MappedModel) -> str:
+    """What is wrong with the focal lengths of most images, or nothing."""
+    ratios = np.array([one.focal_px / max(one.width, one.height) for one in model.intrinsics])
+    absurd = (ratios < MIN_FOCAL_RATIO) | (ratios > MAX_FOCAL_RATIO)
+    if absurd.mean() <= 0.5:
+        return ""
+    k = int(np.argmax(absurd))
+    return f"focal length {model.intrinsics[k].focal_px:.0f} px is {ratios[k]:.1f} times the longer side"
+
+
+def diverged_focal(model: MappedModel, task: MappingTask) -> str:
+    """How far the focal lengths of most images are from the run's, or nothing."""
+    camera_of = dict(zip(task.images, task.camera_indices, strict=True))
+    trusted = np.array([task.trusted_focal.get(camera_of[image], np.nan) for image in model.images])
+    focal = np.array([one.focal_px for one in model.intrinsics])
+    diverged = np.abs(np.log(focal / trusted)) > np.log1p(FOCAL_TOLERANCE)  # False where the run has none
+    if diverged.mean() <= 0.5:
+        return ""
+    k = int(np.argmax(diverged))
+    return f"focal length {focal[k]:.0f} px, the run's is {trusted[k]:.0f} px"
 
 
 def find_jumps(model: MappedModel, order: Sequence[int], inliers: Mapping[Pair, int]) -> list[int]:
@@ -362,19 +406,68 @@ def find_jumps(model: MappedModel, order: Sequence[int], inliers: Mapping[Pair, 
     return jumps
 
 
+def find_hinges(model: MappedModel) -> list[int]:
+    """Positions k such that fewer than MIN_HINGE_POINTS points are seen on both sides of image k and the next.
+
+    The two sides may turn and grow against each other about so few points, however well they fit.
+    """
+    tracks = model.tracks
+    position = np.searchsorted(model.images, tracks.image_of_observation)
+    num_points = len(tracks.points_seg)
+    first, last = np.full(num_points, len(model.images)), np.full(num_points, -1)
+    np.minimum.at(first, tracks.point_of_observation, position)
+    np.maximum.at(last, tracks.point_of_observation, position)
+    return [k for k in range(len(model.images) - 1) if np.count_nonzero((first <= k) & (last > k)) < MIN_HINGE_POINTS]
+
+
+def near_positions(images: Sequence[int], order: Mapping[int, int]) -> Iterator[tuple[int, int]]:
+    """Positions (a, b) of images that are at most NEAR_STEPS apart in ``order``, a before b."""
+    for a in range(len(images)):
+        for b in range(a + 1, min(a + 1 + NEAR_STEPS, len(images))):
+            if abs(order[images[b]] - order[images[a]]) <= NEAR_STEPS:
+                yield a, b
+
+
+def explained_share(model: MappedModel, a: int, b: int, database: pycolmap.Database) -> float:
+    """Share of the verified matches of the images at positions a and b that fit the model's relative pose."""
+    first, second = model.images[a] + 1, model.images[b] + 1
+    matches = database.read_two_view_geometry(first, second).inlier_matches
+    xy_first = np.asarray(database.read_keypoints(first), dtype=np.float64)[matches[:, 0], :2]
+    xy_second = np.asarray(database.read_keypoints(second), dtype=np.float64)[matches[:, 1], :2]
+    return float(np.mean(epipolar_errors_px(model, a, b, xy_first, xy_second) < MAX_EPIPOLAR_ERROR_PX))
+
+
 def epipolar_errors_px(
-    model: MappedModel, k: int, xy_first: npt.NDArray[np.float64], xy_second: npt.NDArray[np.float64]
+    model: MappedModel, a: int, b: int, xy_first: npt.NDArray[np.float64], xy_second: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """(M,) Sampson errors of points of image ``k`` and the next under the model's relative pose, in pixels."""
-    second_from_first = pycolmap.Rigid3d(model.seg_from_cam[k + 1]).inverse() * pycolmap.Rigid3d(model.seg_from_cam[k])
+    """(M,) Sampson errors in pixels of points of the images at positions a and b under the model's poses."""
+    second_from_first = pycolmap.Rigid3d(model.seg_from_cam[b]).inverse() * pycolmap.Rigid3d(model.seg_from_cam[a])
     squared = pycolmap.compute_squared_sampson_error(
-        model.intrinsics[k].rays_cam(xy_first)[:, :2],
-        model.intrinsics[k + 1].rays_cam(xy_second)[:, :2],
+        model.intrinsics[a].rays_cam(xy_first)[:, :2],
+        model.intrinsics[b].rays_cam(xy_second)[:, :2],
         pycolmap.essential_matrix_from_pose(second_from_first),
     )
-    focal_px = 0.5 * (model.intrinsics[k].focal_px + model.intrinsics[k + 1].focal_px)
+    focal_px = 0.5 * (model.intrinsics[a].focal_px + model.intrinsics[b].focal_px)
     errors: npt.NDArray[np.float64] = focal_px * np.sqrt(squared)
     return errors
+
+
+def connected_groups(models: Sequence[MappedModel]) -> list[list[MappedModel]]:
+    """Models that are linked by MIN_SHARED_IMAGES common images, directly or through others."""
+    groups: list[list[MappedModel]] = []
+    for model in models:
+        linked = [group for group in groups if _share_images(model, group)]
+        groups = [group for group in groups if group not in linked]
+        groups.append([model, *[other for group in linked for other in group]])
+    return groups
+
+
+def _share_images(model: MappedModel, group: Iterable[MappedModel]) -> bool:
+    return any(len(set(model.images) & set(other.images)) >= MIN_SHARED_IMAGES for other in group)
+
+
+def _placed(models: Iterable[MappedModel]) -> set[int]:
+    return {image for model in models for image in model.images}
 
 
 def _median_depth(model: MappedModel, k: int) -> float:
