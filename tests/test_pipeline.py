@@ -17,7 +17,7 @@ import trimesh
 from read_colmap_independently import read_binary
 
 from smust3r_colmap.config import ClassicalConfig, FusionConfig, OutputConfig, RunConfig, SegmentationConfig
-from smust3r_colmap.demo import write_demo
+from smust3r_colmap.demo import DemoScene, demo_intrinsics, write_demo
 from smust3r_colmap.errors import ConfigError, ReconstructionError
 from smust3r_colmap.evaluation import compare_trajectories, read_poses_txt, read_reference_sparse
 from smust3r_colmap.pipeline import reconstruct
@@ -244,6 +244,20 @@ def test_two_unconnected_rooms_become_two_models_largest_first(room: Path, tmp_p
     first = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
     assert {image.name[0] for image in first.images.values()} == {"b"}
     assert pycolmap.Reconstruction(tmp_path / "out/sparse/1").num_reg_images() == 6
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_handful_of_photographs_is_enough(count: int, tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    scene = DemoScene()
+    for k, world_from_cam in enumerate(scene.camera_path(72)[:count]):
+        rgb, _ = scene.render(world_from_cam, demo_intrinsics(320, 240))
+        cv2.imwrite(str(images / f"{k}.png"), rgb[:, :, ::-1])
+    summary = run(images, tmp_path / "out")
+    assert summary.exit_code == 0
+    assert summary.models[0].num_images == count
+    assert summary.models[0].num_points > 500
 
 
 def test_odd_names_survive_to_the_model(room: Path, tmp_path: Path) -> None:

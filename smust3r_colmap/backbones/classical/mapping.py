@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 ENOUGH_REGISTERED = 0.9
 """Share of a segment's images in sound models at which the ladder stops."""
 MIN_PIECE_IMAGES = 4
-"""Smaller models are too weak to be a node; a segment that is itself smaller may still be one."""
+"""Smaller models are too weak to be a node; only of a smaller segment they are all one can have."""
 MIN_SHARED_IMAGES = 4
 """Common images that can join two models by a similarity with something left over to check it."""
 MAX_TURN_DEG = 60.0
@@ -132,7 +132,7 @@ class _Ladder:
         self.candidates: list[tuple[MappedModel, ...]] = []
         self.largest_output: Path | None = None
         self.mapped: dict[str, dict[int, pycolmap.Reconstruction]] = {}
-        self.min_images = min(MIN_PIECE_IMAGES, len(task.images))
+        self.min_images = MIN_PIECE_IMAGES if len(task.images) >= MIN_PIECE_IMAGES else 2
         self.inliers = self._build_database("segment.db", task.pairs)
 
     def climb(self) -> None:
@@ -259,8 +259,9 @@ class _Ladder:
             options.mapper.init_max_forward_motion = 1.0
             options.mapper.init_min_num_inliers = 50
             options.mapper.abs_pose_min_num_inliers = 15
-        if len(self.task.images) < 3:
-            options.mapper.init_min_tri_angle = 2.0
+        if len(self.task.images) < MIN_PIECE_IMAGES:
+            # There is hardly a third view that could confirm a point.
+            options.triangulation.ignore_two_view_tracks = False
         name = "incremental" if not relaxed else ("continued" if start else "relaxed")
         output = self.scratch / (name if database == "segment.db" else f"{name}-near")
         if output.name in self.mapped:  # a second opinion and a later rung may ask the same
