@@ -32,18 +32,14 @@ from smust3r_colmap.backbones.classical.features import (
     plan_pairs,
     write_images,
 )
-from smust3r_colmap.backbones.classical.mapping import (
-    MappedModel,
-    MappedSegment,
-    MappingTask,
+from smust3r_colmap.backbones.classical.mapped_model import MappedModel, connected_groups, restrict_model
+from smust3r_colmap.backbones.classical.mapping import MappedSegment, MappingTask, map_segment
+from smust3r_colmap.backbones.classical.model_checks import (
     absurd_focal,
-    connected_groups,
     diverged_focal,
     epipolar_errors_px,
     find_hinges,
     find_jumps,
-    map_segment,
-    restrict_model,
 )
 from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
 from smust3r_colmap.config import ClassicalConfig
@@ -296,14 +292,12 @@ def read_only_segment(number: int, model: MappedModel) -> MappedSegment:
     return MappedSegment(segment=number, models=(model,), attempts=(), unregistered=())
 
 
-def test_one_odd_camera_of_many_does_not_condemn_a_model(
-    synthetic: tuple[MappingTask, pycolmap.Reconstruction],
-) -> None:
-    task = replace(synthetic[0], camera_indices=tuple(range(NUM_IMAGES)), cameras=synthetic[0].cameras * NUM_IMAGES)
-    model = model_of_walk(NUM_IMAGES)
-    assert diverged_focal(model, replace(task, trusted_focal={3: 900.0})) == ""
+def test_one_odd_camera_of_many_does_not_condemn_a_model() -> None:
+    model = model_of_walk(8)
+    camera_of = {image: image for image in model.images}
+    assert diverged_focal(model, camera_of, {3: 900.0}) == ""
     odd = dict.fromkeys(range(5), 900.0)
-    assert diverged_focal(model, replace(task, trusted_focal=odd)) == "focal length 500 px, the run's is 900 px"
+    assert diverged_focal(model, camera_of, odd) == "focal length 500 px, the run's is 900 px"
 
 
 def test_a_focal_length_of_nonsense_is_refused_with_its_number() -> None:

@@ -18,15 +18,9 @@ import numpy.typing as npt
 import pycolmap
 
 from smust3r_colmap.backbones.classical.features import internal_name, open_database
-from smust3r_colmap.backbones.classical.mapping import (
-    ENOUGH_REGISTERED,
-    MappedModel,
-    MappedSegment,
-    MappingTask,
-    diverged_focal,
-    map_segment,
-    model_from_reconstruction,
-)
+from smust3r_colmap.backbones.classical.mapped_model import MappedModel, model_from_reconstruction, placed_images
+from smust3r_colmap.backbones.classical.mapping import ENOUGH_REGISTERED, MappedSegment, MappingTask, map_segment
+from smust3r_colmap.backbones.classical.model_checks import diverged_focal
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import UnregisteredImage
@@ -93,16 +87,16 @@ def calibrate_segment(task: CalibrationTask) -> MappedSegment:
     """
     mapped = task.mapped
     trusted = {camera: intrinsics.focal_px for camera, intrinsics in task.agreed.items()}
-    mapping = replace(task.mapping, trusted_focal=trusted)
-    sound = [model for model in mapped.models if not diverged_focal(model, mapping)]
-    placed = {image for model in sound for image in model.images}
+    camera_of = dict(zip(task.mapping.images, task.mapping.camera_indices, strict=True))
+    sound = [model for model in mapped.models if not diverged_focal(model, camera_of, trusted)]
+    placed = placed_images(sound)
     if len(placed) >= ENOUGH_REGISTERED * len(task.mapping.images):
         mapped = replace(mapped, models=tuple(sound), unregistered=left_over(task.mapping, sound, mapped.unregistered))
     elif len(sound) < len(mapped.models):
         start = tuple(task.agreed.get(index, camera) for index, camera in enumerate(task.mapping.cameras))
-        again = map_segment(replace(mapping, cameras=start))
+        again = map_segment(replace(task.mapping, cameras=start, trusted_focal=trusted))
         attempts = (*mapped.attempts, "focal length off the run's: mapped again", *again.attempts)
-        if len({image for model in again.models for image in model.images}) < len(placed):
+        if len(placed_images(again.models)) < len(placed):
             left = left_over(task.mapping, sound, again.unregistered)
             again = replace(again, models=tuple(sound), unregistered=left)
         mapped = replace(again, attempts=attempts)
@@ -119,7 +113,7 @@ def left_over(
     task: MappingTask, models: Sequence[MappedModel], known: Sequence[UnregisteredImage]
 ) -> tuple[UnregisteredImage, ...]:
     """Images of the segment in none of ``models``, with the reason where one is known already."""
-    placed = {image for model in models for image in model.images}
+    placed = placed_images(models)
     reasons = {one.image: one.reason for one in known}
     return tuple(
         UnregisteredImage(image=image, reason=reasons.get(image, "its model's focal length diverged"))

@@ -2,7 +2,7 @@
 
 No mapper is safe alone: the incremental one finds no start on straight forward motion and stops at
 weak spots, the global one registers more but may be wrong with a perfect-looking error. So a ladder
-is climbed until a model passes the tests: incremental, relaxed incremental, global. What still does
+is climbed until the models pass the checks: incremental, relaxed incremental, global. What still does
 not hold together becomes several pieces. Everything here runs in a child process.
 The next module to read is ``calibration``.
 """
@@ -11,19 +11,32 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
 from smust3r_colmap.backbones.classical.features import Pair, open_database, write_images
+from smust3r_colmap.backbones.classical.mapped_model import (
+    MappedModel,
+    connected_groups,
+    model_from_reconstruction,
+    placed_images,
+    restrict_model,
+    share_images,
+)
+from smust3r_colmap.backbones.classical.model_checks import (
+    absurd_focal,
+    diverged_focal,
+    find_denied_steps,
+    find_hinges,
+    find_jumps,
+)
 from smust3r_colmap.geometry.camera import Intrinsics
-from smust3r_colmap.geometry.sim3 import invert_rigid
-from smust3r_colmap.products import Tracks, UnregisteredImage
+from smust3r_colmap.products import UnregisteredImage
 
 logger = logging.getLogger(__name__)
 
@@ -31,34 +44,10 @@ ENOUGH_REGISTERED = 0.9
 """Share of a segment's images in sound models at which the ladder stops."""
 MIN_PIECE_IMAGES = 4
 """Smaller models are too weak to be a node; only of a smaller segment they are all one can have."""
-MIN_SHARED_IMAGES = 4
-"""Common images that can join two models by a similarity with something left over to check it."""
-MAX_TURN_DEG = 60.0
-"""Neighbouring images that match cannot have turned by more (honest walks: 52 at most; folds: 150)."""
-MAX_STEP_RATIO = 10.0
-"""Nor moved by more than this many median steps (honest walks: 1.8; folds: 33 to 42) ..."""
-MIN_JUMP_DEPTHS = 0.5
-"""... unless the step is small beside the distance of what they see, as after a pause."""
 MIN_PAIR_INLIERS = 15
 """Verified matches below which COLMAP does not use a pair."""
-MIN_EXPLAINED_SHARE = 0.5
-"""A relative pose that fewer of the pair's verified matches agree with is wrong (sound models: 0.57 at
-least; wrong ones, on a walk round a building: 0 to 0.44)."""
-MIN_HINGE_POINTS = 12
-"""Common points that hold two halves of a model together (honest links: 16 at least; a wrong one: 9)."""
-NEAR_STEPS = 2
-"""How far apart in order two images may be to deny each other; farther ones may be look-alikes."""
-MAX_EPIPOLAR_ERROR_PX = 4.0
-"""COLMAP's own bound for an inlier of two views."""
-STRONG_PAIR_INLIERS = 30
-"""Verified matches that make two images certain neighbours (COLMAP's own bar for registration)."""
 NEAR_OFFSET = 4
 """Reach of the pairs that are left when the longer ones folded the model."""
-MIN_FOCAL_RATIO, MAX_FOCAL_RATIO = 0.2, 8.0
-"""Focal length over the longer side, from a 136 degree lens to a 7 degree one; a few images in a row
-on nearly parallel rays self-calibrate to anything."""
-FOCAL_TOLERANCE = 0.15
-"""A focal length farther from the run's median belongs to a diverged self-calibration."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,18 +72,6 @@ class MappingTask:
     trusted_focal: Mapping[int, float]
     seed: int
     use_global: bool = True
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MappedModel:
-    """One connected model of a segment, as arrays (see ``SegmentPiece`` for shapes)."""
-
-    images: tuple[int, ...]
-    seg_from_cam: npt.NDArray[np.float64]
-    intrinsics: tuple[Intrinsics, ...]
-    tracks: Tracks
-    reprojection_error_px: float
-    method: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,17 +140,17 @@ class _Ladder:
         # Earlier rungs are stricter: a later one has to place clearly more images.
         best = self.candidates[0]
         for models in self.candidates[1:]:
-            if len(_placed(models)) > 1.05 * len(_placed(best)):
+            if len(placed_images(models)) > 1.05 * len(placed_images(best)):
                 best = models
         chosen: list[MappedModel] = []
         for models, share_of_new in [(best, 0.1), *[(models, 0.3) for models in self.candidates]]:
             for model in models:
-                new = set(model.images) - _placed(chosen)
+                new = set(model.images) - placed_images(chosen)
                 if len(new) >= max(2, share_of_new * len(model.images)):
                     chosen.append(model)
         for models in self.candidates:
             for model in models:
-                if sum(_share_images(model, group) for group in connected_groups(chosen)) >= 2:
+                if sum(share_images(model, group) for group in connected_groups(chosen)) >= 2:
                     chosen.append(model)  # a bridge
         return tuple(sorted(chosen, key=lambda model: -len(model.images)))
 
@@ -216,7 +193,7 @@ class _Ladder:
                 self._build_database("near.db", near)
                 again = self._convert(self._incremental("near.db", relaxed=False), f"{name}, near pairs")
                 parts = [part for model in again for part in self._cut(model)]
-                if len(_placed(parts)) >= len(_placed(found)):
+                if len(placed_images(parts)) >= len(placed_images(found)):
                     self.attempts.append(f"{name}: mapped again with near pairs only")
                     found = parts
         accepted = []
@@ -234,7 +211,8 @@ class _Ladder:
     def _enough(self) -> bool:
         """Some attempt placed nearly all images, in models that hang together."""
         return any(
-            len(_placed(models)) >= ENOUGH_REGISTERED * len(self.task.images) and len(connected_groups(models)) == 1
+            len(placed_images(models)) >= ENOUGH_REGISTERED * len(self.task.images)
+            and len(connected_groups(models)) == 1
             for models in self.candidates
         )
 
@@ -297,28 +275,15 @@ class _Ladder:
         """Why a model cannot be believed, or nothing. Its pixels look perfect in every such case."""
         if not np.isfinite(model.reprojection_error_px) or model.reprojection_error_px > 3.0:
             return f"mean reprojection error {model.reprojection_error_px:.2f} px"
-        return absurd_focal(model) or diverged_focal(model, self.task)
+        camera_of = dict(zip(self.task.images, self.task.camera_indices, strict=True))
+        return absurd_focal(model) or diverged_focal(model, camera_of, self.task.trusted_focal)
 
     def _count_jumps(self, models: Sequence[MappedModel]) -> int:
         return sum(len(find_jumps(model, self.task.images, self.inliers)) for model in models)
 
     def _denied_steps(self, model: MappedModel) -> list[int]:
-        """Positions k such that the matches deny how the model places image k and the next.
-
-        Every pair of near images with STRONG_PAIR_INLIERS has to find most of its verified matches on
-        their epipolar lines. That tells a fold, or a bad bridge, from a drone's half turn at the end
-        of a strip, where the model turns as well but the matches agree.
-        """
-        order = {image: place for place, image in enumerate(self.task.images)}
-        denied = set()
         with open_database(self.task.database) as database:
-            for a, b in near_positions(model.images, order):
-                first, second = model.images[a], model.images[b]
-                if self.inliers.get((first, second), 0) >= STRONG_PAIR_INLIERS:
-                    share = explained_share(model, a, b, database)
-                    if share < MIN_EXPLAINED_SHARE:
-                        denied.add(b - 1)
-        return sorted(denied)
+            return find_denied_steps(model, self.task.images, self.inliers, database)
 
     def _cut(self, model: MappedModel) -> list[MappedModel]:
         """The model without denied steps and hinges: its parts between them, those that are large enough."""
@@ -356,175 +321,3 @@ class _Ladder:
     def _convert(self, models: dict[int, pycolmap.Reconstruction], method: str) -> list[MappedModel]:
         converted = [model_from_reconstruction(model, method) for model in models.values()]
         return [model for model in converted if len(model.images) >= self.min_images]
-
-
-def absurd_focal(model: MappedModel) -> str:
-    """What is wrong with the focal lengths of most images, or nothing."""
-    ratios = np.array([one.focal_px / max(one.width, one.height) for one in model.intrinsics])
-    absurd = (ratios < MIN_FOCAL_RATIO) | (ratios > MAX_FOCAL_RATIO)
-    if absurd.mean() <= 0.5:
-        return ""
-    k = int(np.argmax(absurd))
-    return f"focal length {model.intrinsics[k].focal_px:.0f} px is {ratios[k]:.1f} times the longer side"
-
-
-def diverged_focal(model: MappedModel, task: MappingTask) -> str:
-    """How far the focal lengths of most images are from the run's, or nothing."""
-    camera_of = dict(zip(task.images, task.camera_indices, strict=True))
-    trusted = np.array([task.trusted_focal.get(camera_of[image], np.nan) for image in model.images])
-    focal = np.array([one.focal_px for one in model.intrinsics])
-    diverged = np.abs(np.log(focal / trusted)) > np.log1p(FOCAL_TOLERANCE)  # False where the run has none
-    if diverged.mean() <= 0.5:
-        return ""
-    k = int(np.argmax(diverged))
-    return f"focal length {focal[k]:.0f} px, the run's is {trusted[k]:.0f} px"
-
-
-def find_jumps(model: MappedModel, order: Sequence[int], inliers: Mapping[Pair, int]) -> list[int]:
-    """Positions k where ``model.images[k]`` and its successor in ``order`` match but stand apart.
-
-    A pair counts when it is consecutive in ``order`` and has STRONG_PAIR_INLIERS verified matches;
-    standing apart is a turn above MAX_TURN_DEG, or a step above MAX_STEP_RATIO median steps and
-    above MIN_JUMP_DEPTHS of the distance of what the first image sees.
-    """
-    place = {image: k for k, image in enumerate(order)}
-    steps = []
-    for k, (first, second) in enumerate(pairwise(model.images)):
-        if place[second] - place[first] == 1 and inliers.get((first, second), 0) >= STRONG_PAIR_INLIERS:
-            steps.append(k)
-    if not steps:
-        return []
-    centres = model.seg_from_cam[:, :, 3]
-    lengths = {k: float(np.linalg.norm(centres[k + 1] - centres[k])) for k in steps}
-    median = float(np.median(list(lengths.values())))
-    jumps = []
-    for k in steps:
-        relative = model.seg_from_cam[k, :, :3].T @ model.seg_from_cam[k + 1, :, :3]
-        turn_deg = np.degrees(np.arccos(np.clip((np.trace(relative) - 1) / 2, -1, 1)))
-        far = lengths[k] > MAX_STEP_RATIO * median and lengths[k] > MIN_JUMP_DEPTHS * _median_depth(model, k)
-        if turn_deg > MAX_TURN_DEG or far:
-            jumps.append(k)
-    return jumps
-
-
-def find_hinges(model: MappedModel) -> list[int]:
-    """Positions k such that fewer than MIN_HINGE_POINTS points are seen on both sides of image k and the next.
-
-    The two sides may turn and grow against each other about so few points, however well they fit.
-    """
-    tracks = model.tracks
-    position = np.searchsorted(model.images, tracks.image_of_observation)
-    num_points = len(tracks.points_seg)
-    first, last = np.full(num_points, len(model.images)), np.full(num_points, -1)
-    np.minimum.at(first, tracks.point_of_observation, position)
-    np.maximum.at(last, tracks.point_of_observation, position)
-    return [k for k in range(len(model.images) - 1) if np.count_nonzero((first <= k) & (last > k)) < MIN_HINGE_POINTS]
-
-
-def near_positions(images: Sequence[int], order: Mapping[int, int]) -> Iterator[tuple[int, int]]:
-    """Positions (a, b) of images that are at most NEAR_STEPS apart in ``order``, a before b."""
-    for a in range(len(images)):
-        for b in range(a + 1, min(a + 1 + NEAR_STEPS, len(images))):
-            if abs(order[images[b]] - order[images[a]]) <= NEAR_STEPS:
-                yield a, b
-
-
-def explained_share(model: MappedModel, a: int, b: int, database: pycolmap.Database) -> float:
-    """Share of the verified matches of the images at positions a and b that fit the model's relative pose."""
-    first, second = model.images[a] + 1, model.images[b] + 1
-    matches = database.read_two_view_geometry(first, second).inlier_matches
-    xy_first = np.asarray(database.read_keypoints(first), dtype=np.float64)[matches[:, 0], :2]
-    xy_second = np.asarray(database.read_keypoints(second), dtype=np.float64)[matches[:, 1], :2]
-    return float(np.mean(epipolar_errors_px(model, a, b, xy_first, xy_second) < MAX_EPIPOLAR_ERROR_PX))
-
-
-def epipolar_errors_px(
-    model: MappedModel, a: int, b: int, xy_first: npt.NDArray[np.float64], xy_second: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
-    """(M,) Sampson errors in pixels of points of the images at positions a and b under the model's poses."""
-    second_from_first = pycolmap.Rigid3d(model.seg_from_cam[b]).inverse() * pycolmap.Rigid3d(model.seg_from_cam[a])
-    squared = pycolmap.compute_squared_sampson_error(
-        model.intrinsics[a].rays_cam(xy_first)[:, :2],
-        model.intrinsics[b].rays_cam(xy_second)[:, :2],
-        pycolmap.essential_matrix_from_pose(second_from_first),
-    )
-    focal_px = 0.5 * (model.intrinsics[a].focal_px + model.intrinsics[b].focal_px)
-    errors: npt.NDArray[np.float64] = focal_px * np.sqrt(squared)
-    return errors
-
-
-def connected_groups(models: Sequence[MappedModel]) -> list[list[MappedModel]]:
-    """Models that are linked by MIN_SHARED_IMAGES common images, directly or through others."""
-    groups: list[list[MappedModel]] = []
-    for model in models:
-        linked = [group for group in groups if _share_images(model, group)]
-        groups = [group for group in groups if group not in linked]
-        groups.append([model, *[other for group in linked for other in group]])
-    return groups
-
-
-def _share_images(model: MappedModel, group: Iterable[MappedModel]) -> bool:
-    return any(len(set(model.images) & set(other.images)) >= MIN_SHARED_IMAGES for other in group)
-
-
-def _placed(models: Iterable[MappedModel]) -> set[int]:
-    return {image for model in models for image in model.images}
-
-
-def _median_depth(model: MappedModel, k: int) -> float:
-    seen = model.tracks.point_of_observation[model.tracks.image_of_observation == model.images[k]]
-    if not len(seen):
-        return 0.0
-    cam_from_seg = invert_rigid(model.seg_from_cam[k])
-    return float(np.median(model.tracks.points_seg[seen] @ cam_from_seg[2, :3] + cam_from_seg[2, 3]))
-
-
-def restrict_model(model: MappedModel, positions: Sequence[int]) -> MappedModel:
-    """The same model with only some of its images, and the points they still see at least twice."""
-    images = tuple(model.images[k] for k in positions)
-    tracks = model.tracks
-    kept = np.isin(tracks.image_of_observation, images)
-    points, compact, counts = np.unique(tracks.point_of_observation[kept], return_inverse=True, return_counts=True)
-    seen_twice = counts[compact] >= 2
-    renumber = np.cumsum(counts >= 2) - 1
-    return replace(
-        model,
-        images=images,
-        seg_from_cam=model.seg_from_cam[list(positions)],
-        intrinsics=tuple(model.intrinsics[k] for k in positions),
-        tracks=Tracks(
-            points_seg=tracks.points_seg[points[counts >= 2]],
-            point_of_observation=renumber[compact][seen_twice],
-            image_of_observation=tracks.image_of_observation[kept][seen_twice],
-            feature_of_observation=tracks.feature_of_observation[kept][seen_twice],
-        ),
-        method=f"{model.method}, cut",
-    )
-
-
-def model_from_reconstruction(reconstruction: pycolmap.Reconstruction, method: str) -> MappedModel:
-    """Arrays of a pycolmap model whose image ids are index + 1; images ascend."""
-    ids = sorted(reconstruction.reg_image_ids())
-    poses = [reconstruction.image(i).cam_from_world().inverse().matrix() for i in ids]
-    intrinsics = [Intrinsics.from_colmap(reconstruction.camera(reconstruction.image(i).camera_id)) for i in ids]
-    points, owner, image, feature = [], [], [], []
-    for row, point_id in enumerate(sorted(reconstruction.points3D)):
-        point = reconstruction.points3D[point_id]
-        points.append(point.xyz)
-        for element in point.track.elements:
-            owner.append(row)
-            image.append(element.image_id - 1)
-            feature.append(element.point2D_idx)
-    return MappedModel(
-        images=tuple(i - 1 for i in ids),
-        seg_from_cam=np.array(poses, dtype=np.float64).reshape(-1, 3, 4),
-        intrinsics=tuple(intrinsics),
-        tracks=Tracks(
-            points_seg=np.array(points, dtype=np.float64).reshape(-1, 3),
-            point_of_observation=np.array(owner, dtype=np.int64),
-            image_of_observation=np.array(image, dtype=np.int64),
-            feature_of_observation=np.array(feature, dtype=np.int64),
-        ),
-        reprojection_error_px=float(reconstruction.compute_mean_reprojection_error()),
-        method=method,
-    )
