@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -38,6 +40,7 @@ from smust3r_colmap.backbones.classical.model_checks import (
     absurd_focal,
     diverged_focal,
     epipolar_errors_px,
+    find_denied_steps,
     find_hinges,
     find_jumps,
 )
@@ -47,7 +50,7 @@ from smust3r_colmap.errors import StorageError
 from smust3r_colmap.execution import TaskFailure, TaskResult, map_tasks
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import Sim3
-from smust3r_colmap.products import Segment, Tracks
+from smust3r_colmap.products import ImageCollection, Segment, SourceImage, Tracks
 from smust3r_colmap.progress import QuietReporter
 from smust3r_colmap.run_directory import RunDirectory
 from smust3r_colmap.stored_maps import StoredMaps
@@ -267,6 +270,21 @@ def test_mapped_segments_come_back_from_disk(
     )
 
 
+def test_a_model_that_its_matches_deny_is_broken_at_that_step(
+    synthetic: tuple[MappingTask, pycolmap.Reconstruction],
+) -> None:
+    """The images look from all sides, so every step is a jump; only the one that was bent is denied."""
+    task, _ = synthetic
+    (model,) = map_segment(task).models
+    inliers = dict.fromkeys(task.pairs, 200)
+    with open_database(task.database) as database:
+        assert find_jumps(model, task.images, inliers)
+        assert find_denied_steps(model, task.images, inliers, database) == []
+        model.seg_from_cam[5:, :, :3] = model.seg_from_cam[5:, :, :3] @ rotation_about_y(25.0)
+        assert 4 in find_denied_steps(model, task.images, inliers, database)
+        assert not {0, 1, 2} & set(find_denied_steps(model, task.images, inliers, database))
+
+
 # ---------------------------------------------------------------------- calibration
 def test_the_weighted_median_follows_the_weight() -> None:
     values = np.array([1.0, 2.0, 30.0])
@@ -414,6 +432,26 @@ def test_a_segment_that_failed_is_tried_again_at_the_next_start(
         assert not folder.is_done
     assert found.models == kept.models
     assert found.attempts == ("calibrated: out of memory",)
+
+
+def die_in_the_global_mapper(task: MappingTask) -> MappedSegment:
+    if task.use_global:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return read_only_segment(task.segment, model_of_walk(6))
+
+
+def test_a_global_mapper_that_kills_its_process_costs_only_its_own_rung(
+    synthetic: tuple[MappingTask, pycolmap.Reconstruction], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(backbone_module, "map_segment", die_in_the_global_mapper)
+    image = SourceImage(name="0", path=tmp_path / "0", width=640, height=480, camera=0, digest="0")
+    collection = ImageCollection(
+        images=tuple(replace(image, name=str(k)) for k in range(NUM_IMAGES)), cameras=(CAMERA,)
+    )
+    backbone = ClassicalBackbone(ClassicalConfig(), workers=1, seed=0)
+    with RunDirectory(tmp_path / "out") as run:
+        (mapped,) = backbone._map([synthetic[0]], collection, run, "features", QuietReporter(sys.stderr))
+    assert mapped.models[0].images == tuple(range(6))
 
 
 def test_a_sweep_that_failed_leaves_readable_empty_maps_and_is_tried_again(tmp_path: Path) -> None:
