@@ -25,7 +25,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,8 @@ SIFT_FEATURES = 6000
 EXHAUSTIVE_UP_TO = 50
 SEQUENTIAL_OVERLAP = 10
 SPREAD_IMAGES = 80
+
+OUR_MAPPING_STAGES = ("mapping", "mapping without the global mapper", "calibration", "alignment")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +122,9 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--skip-ours", action="store_true")
     parser.add_argument("--skip-incremental", action="store_true")
     parser.add_argument("--skip-global", action="store_true")
-    parser.add_argument("--reuse", action="store_true", help="take COLMAP's finished stages from the working folder")
+    parser.add_argument(
+        "--reuse", action="store_true", help="take what an earlier comparison finished from the working folder"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures there, too")
     return parser.parse_args()
 
@@ -186,9 +190,18 @@ def run_methods(dataset: Dataset, arguments: argparse.Namespace) -> Iterator[Res
 
 
 def run_ours(dataset: Dataset, output: Path, arguments: argparse.Namespace) -> Result:
-    """``smust3r-colmap reconstruct`` from scratch."""
+    """``smust3r-colmap reconstruct`` from scratch, or what an earlier comparison left with --reuse."""
     length = arguments.segment_length or (12 if dataset.name in SHORT_SEGMENTS else 60)
     overlap = arguments.overlap or length // 2
+    record = output.parent / "ours.json"
+    if not (arguments.reuse and record.exists()):
+        measure_ours(dataset, output, record, length=length, overlap=overlap)
+    cost = Cost(**json.loads(record.read_text(encoding="utf-8")))
+    return judge(f"ours l={length} p={overlap}", dataset, output / "sparse", costs_by_stage(cost, output))
+
+
+def measure_ours(dataset: Dataset, output: Path, record: Path, *, length: int, overlap: int) -> None:
+    """Run the command on an empty output folder and write down what it took."""
     shutil.rmtree(output, ignore_errors=True)
     output.parent.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "smust3r_colmap", "reconstruct", str(dataset.images), "--output", str(output)]
@@ -196,7 +209,33 @@ def run_ours(dataset: Dataset, output: Path, arguments: argparse.Namespace) -> R
     cost = run_child([*command, *settings], output.parent / "ours.log")
     # 3 is the exit code of a run that finished with a weak result, which the table shows anyway.
     cost = Cost(**{**asdict(cost), "exit_code": 0 if cost.exit_code == 3 else cost.exit_code})
-    return judge(f"ours l={length} p={overlap}", dataset, output / "sparse", {"all": cost})
+    record.write_text(json.dumps(asdict(cost)), encoding="utf-8")
+
+
+def costs_by_stage(cost: Cost, output: Path) -> dict[str, Cost]:
+    """The whole cost, parted into what COLMAP has too and the rest (depth maps, fusion, files)."""
+    summary = output / "summary.json"
+    if not summary.exists():
+        return {"rest": cost}
+    stages = json.loads(summary.read_text(encoding="utf-8"))["stages"]
+    costs = {}
+    for name in ("features", "matching", "mapping"):
+        # Mapping is everything up to one model: the segments, their common calibration, their alignment.
+        parts = [name] if name != "mapping" else [*OUR_MAPPING_STAGES]
+        chosen = [stage for stage in stages if stage["name"] in parts]
+        costs[name] = replace(
+            cost,
+            cpu_s=sum(stage["cpu_s"] for stage in chosen),
+            wall_s=sum(stage["wall_s"] for stage in chosen),
+            exit_code=0,
+        )
+    named = list(costs.values())
+    costs["rest"] = replace(
+        cost,
+        cpu_s=max(0.0, cost.cpu_s - sum(one.cpu_s for one in named)),
+        wall_s=max(0.0, cost.wall_s - sum(one.wall_s for one in named)),
+    )
+    return costs
 
 
 def judge(method: str, dataset: Dataset, sparse: Path, costs: dict[str, Cost]) -> Result:
@@ -303,7 +342,7 @@ def run_child(command: list[str], log: Path) -> Cost:
 def render_table(dataset: Dataset, results: list[Result]) -> str:
     """One line per method."""
     header = ["method", "images", "models", f"rms {dataset.unit}", "% extent", "rot deg med", "mean"]
-    header += ["CPU s feat", "match", "map", "all", "wall s", "MiB", ""]
+    header += ["CPU/wall s feat", "match", "map", "rest", "all", "MiB", ""]
     lines = [header, *(table_line(result, dataset.num_images) for result in results)]
     widths = [max(len(line[column]) for line in lines) for column in range(len(header))]
     rows = ["  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]
@@ -320,15 +359,17 @@ def table_line(result: Result, num_images: int) -> list[str]:
         accuracy = [f"{found.position_rmse:.4g}", f"{found.position_rmse_percent:.3g}"]
         accuracy += [f"{found.rotation_median_deg:.3g}", f"{found.rotation_mean_deg:.3g}"]
     costs = result.costs
-    stages = [f"{costs[stage].cpu_s:.0f}" if stage in costs else "-" for stage in ("features", "matching", "mapping")]
+    stages = [
+        f"{costs[stage].cpu_s:.0f}/{costs[stage].wall_s:.0f}" if stage in costs else "-"
+        for stage in ("features", "matching", "mapping", "rest")
+    ]
     return [
         result.method,
         f"{result.registered_largest}/{result.registered_all}/{num_images}",
         str(result.num_models),
         *accuracy,
         *stages,
-        f"{sum(cost.cpu_s for cost in costs.values()):.0f}",
-        f"{sum(cost.wall_s for cost in costs.values()):.0f}",
+        f"{sum(cost.cpu_s for cost in costs.values()):.0f}/{sum(cost.wall_s for cost in costs.values()):.0f}",
         f"{max(cost.peak_mib for cost in costs.values()):.0f}",
         result.remark,
     ]
