@@ -63,7 +63,7 @@ class ClassicalConfig:
     dense_size: int = 384
     """Longer side of the depth maps."""
     depth_planes: int = 64
-    """Depth hypotheses per pixel, uniform in inverse depth."""
+    """Depth hypotheses per pixel at most, uniform in inverse depth; fewer where steps of one pixel suffice."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +88,7 @@ class FusionConfig:
     max_points: int = 1_000_000
     """Upper bound of the fused cloud of each model; what a laptop viewer and a splat trainer digest."""
     min_confidence: float = 2.0
-    """Pixels below are left out; 1 is no confidence, each view that agrees adds one."""
+    """Pixels below are left out; 1 is no confidence, each view that agrees adds up to one."""
 
 
 @dataclass(frozen=True, kw_only=True)
