@@ -64,7 +64,7 @@ def test_long_product_stays_a_rotation() -> None:
         scale=np.array(1.0), rotation=Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix(), translation=np.zeros(3)
     )
     total = Sim3.identity()
-    for _ in range(10_000):
+    for _ in range(3000):
         total = total @ step
     np.testing.assert_allclose(total.rotation @ total.rotation.T, np.eye(3), atol=1e-14)
 

@@ -1,1 +1,1 @@
-"""Pure geometry on arrays: no files, no settings, no clocks. Start with ``sim3``."""
+"""Pure geometry on arrays: no files, no settings, no clocks. Start with ``transform``."""

@@ -1,22 +1,40 @@
 """Similarity transforms of space, the group Sim(3), as immutable values.
 
 A variable is named ``b_from_a`` when it takes coordinates in frame a to coordinates in frame b, so
-that neighbours cancel: ``c_from_a = c_from_b @ b_from_a``. The next module to read is ``camera``.
+that neighbours cancel: ``c_from_a = c_from_b @ b_from_a``. The next module to read is ``se3``.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
+from smust3r_colmap.geometry.so3 import (
+    ORTHONORMALITY_TOLERANCE,
+    angle_and_axis,
+    around_axis,
+    determinant,
+    mean_exp,
+    orthonormality_error,
+    reorthonormalised,
+    rotation_log,
+    skew,
+    unskew,
+)
+from smust3r_colmap.geometry.transform import Transform, affine_parts, jacobian_of_linear
+
 FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sim3:
+class Sim3(Transform):
     """``b_from_a``: x_b = scale * rotation @ x_a + translation, with any leading batch axes.
+
+    A tangent vector is (translation 3, rotation vector 3, log scale 1).
 
     Args:
         scale: (...,) float64, positive.
@@ -26,6 +44,8 @@ class Sim3:
     Raises:
         ValueError: a shape, a scale or a rotation is not as above.
     """
+
+    DOF: ClassVar[int] = 7
 
     scale: FloatArray
     rotation: FloatArray
@@ -44,9 +64,8 @@ class Sim3:
             raise ValueError(f"Sim3: scale must be positive and finite, found {scale}")
         if not np.isfinite(translation).all():
             raise ValueError("Sim3: translation is not finite")
-        gram = rotation @ np.swapaxes(rotation, -1, -2)
-        off = np.abs(gram - np.eye(3)).max(initial=0.0)
-        if not off < 1e-6 or (np.linalg.det(rotation) < 0).any():
+        off = orthonormality_error(rotation)
+        if not off < ORTHONORMALITY_TOLERANCE:
             raise ValueError(f"Sim3: not a rotation (orthonormality error {off:.2g})")
         object.__setattr__(self, "scale", scale)
         object.__setattr__(self, "rotation", rotation)
@@ -63,14 +82,21 @@ class Sim3:
 
     @classmethod
     def from_matrix(cls, matrix: npt.ArrayLike) -> Sim3:
-        """From (..., 4, 4) or (..., 3, 4); the scale is the cube root of the determinant."""
-        b_from_a = np.asarray(matrix, dtype=np.float64)
-        scale = np.cbrt(np.linalg.det(b_from_a[..., :3, :3]))
-        return cls(
-            scale=scale,
-            rotation=b_from_a[..., :3, :3] / scale[..., None, None],
-            translation=b_from_a[..., :3, 3],
-        )
+        """From (..., 4, 4) or (..., 3, 4); the scale is the cube root of the determinant.
+
+        Raises:
+            ValueError: the linear part is no multiple of a rotation, or the last row is not (0, 0, 0, 1).
+        """
+        linear, translation = affine_parts(matrix)
+        scale = np.cbrt(determinant(linear))
+        with np.errstate(divide="ignore", invalid="ignore"):  # a singular matrix is refused by its scale
+            rotation = linear / scale[..., None, None]
+        return cls(scale=scale, rotation=rotation, translation=translation)
+
+    @property
+    def batch(self) -> tuple[int, ...]:
+        """The leading axes."""
+        return self.scale.shape
 
     @property
     def matrix(self) -> FloatArray:
@@ -80,6 +106,50 @@ class Sim3:
         out[..., :3, 3] = self.translation
         out[..., 3, 3] = 1.0
         return out
+
+    @classmethod
+    def hat(cls, tangent: npt.ArrayLike) -> FloatArray:
+        """(..., 4, 4) ``[[log_scale I + skew(rotvec), translation], [0, 0]]``."""
+        translation, rotvec, log_scale = _parts(tangent)
+        out = np.zeros((*log_scale.shape, 4, 4))
+        out[..., :3, :3] = skew(rotvec) + log_scale[..., None, None] * np.eye(3)
+        out[..., :3, 3] = translation
+        return out
+
+    @classmethod
+    def vee(cls, algebra: npt.ArrayLike) -> FloatArray:
+        """(..., 7) of (..., 4, 4); the skew part and the mean of the diagonal are taken, the rest is dropped."""
+        matrix = np.asarray(algebra, dtype=np.float64)
+        linear = matrix[..., :3, :3]
+        log_scale = np.trace(linear, axis1=-2, axis2=-1)[..., None] / 3.0
+        return np.concatenate([matrix[..., :3, 3], unskew(linear), log_scale], axis=-1)
+
+    @classmethod
+    def exp(cls, tangent: npt.ArrayLike) -> Sim3:
+        """In closed form: ``scale * rotation`` acts as exp(z) across the axis, z = log_scale + i angle.
+
+        The translation is the mean of ``exp(u hat)`` over u from 0 to 1, which acts as (exp(z) - 1) / z.
+        """
+        translation, rotvec, log_scale = _parts(tangent)
+        angle, axis = angle_and_axis(rotvec)
+        mean = around_axis(axis, mean_exp(log_scale).real, mean_exp(log_scale + 1j * angle))
+        return cls(
+            scale=np.exp(log_scale),
+            rotation=around_axis(axis, np.ones_like(angle), np.exp(1j * angle)),
+            translation=(mean @ translation[..., None])[..., 0],
+        )
+
+    def log(self) -> FloatArray:
+        """(..., 7) with a rotation vector of at most pi; at exactly pi either of the two opposite axes."""
+        log_scale, rotvec = np.log(self.scale), rotation_log(self.rotation)
+        angle, axis = angle_and_axis(rotvec)
+        unmean = around_axis(axis, 1.0 / mean_exp(log_scale).real, 1.0 / mean_exp(log_scale + 1j * angle))
+        translation = (unmean @ self.translation[..., None])[..., 0]
+        return np.concatenate([translation, rotvec, log_scale[..., None]], axis=-1)
+
+    def log_exists(self) -> BoolArray:
+        """(...,) true: every similarity has a logarithm, a rotation of pi has two."""
+        return np.ones(self.batch, dtype=bool)
 
     def apply(self, points_a: npt.ArrayLike) -> FloatArray:
         """Points (..., N, 3) in frame a to frame b; rows that are not finite stay so."""
@@ -94,32 +164,34 @@ class Sim3:
         translation = -scale[..., None] * (rotation @ self.translation[..., None])[..., 0]
         return Sim3(scale=scale, rotation=rotation, translation=translation)
 
-    def __matmul__(self, b_from_a: Sim3) -> Sim3:
-        """``c_from_a = c_from_b @ b_from_a``."""
+    def compose(self, b_from_a: Sim3) -> Sim3:
+        """``c_from_a`` of ``c_from_b`` and ``b_from_a``; batches broadcast."""
         rotated = (self.rotation @ b_from_a.translation[..., None])[..., 0]
         return Sim3(
             scale=self.scale * b_from_a.scale,
-            rotation=_reorthonormalised(self.rotation @ b_from_a.rotation),
+            rotation=reorthonormalised(self.rotation @ b_from_a.rotation),
             translation=self.scale[..., None] * rotated + self.translation,
         )
 
-    def move_cameras(self, a_from_cam: npt.ArrayLike) -> FloatArray:
-        """Rigid camera poses ``a_from_cam`` (..., N, 3, 4) to ``b_from_cam`` (..., N, 3, 4).
-
-        A camera has no size, so the scale moves its centre and leaves its axes orthonormal.
-        """
-        poses = np.asarray(a_from_cam, dtype=np.float64)
-        out = np.empty_like(poses)
-        out[..., :3] = self.rotation[..., None, :, :] @ poses[..., :3]
-        out[..., 3] = self.apply(poses[..., 3])
+    def adjoint(self) -> FloatArray:
+        """(..., 7, 7) ``[[s R, skew(t) R, -t], [0, R, 0], [0, 0, 1]]``."""
+        out = np.zeros((*self.batch, 7, 7))
+        out[..., :3, :3] = self.scale[..., None, None] * self.rotation
+        out[..., :3, 3:6] = skew(self.translation) @ self.rotation
+        out[..., :3, 6] = -self.translation
+        out[..., 3:6, 3:6] = self.rotation
+        out[..., 6, 6] = 1.0
         return out
 
+    def jacobian(self, points_a: npt.ArrayLike) -> FloatArray:
+        """(..., N, 3, 3) ``scale * rotation`` at every point."""
+        return jacobian_of_linear(self.scale[..., None, None] * self.rotation, points_a)
 
-def _reorthonormalised(rotation: FloatArray) -> FloatArray:
-    """The nearest rotation, so that long products do not drift off the group."""
-    u, _, vt = np.linalg.svd(rotation)
-    nearest: FloatArray = u @ vt
-    return nearest
+
+def _parts(tangent: npt.ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Translation (..., 3), rotation vector (..., 3) and log scale (...,) of tangent vectors (..., 7)."""
+    values = np.asarray(tangent, dtype=np.float64)
+    return values[..., :3], values[..., 3:6], values[..., 6]
 
 
 def invert_rigid(b_from_a: npt.ArrayLike) -> FloatArray:
