@@ -2,7 +2,7 @@
 
 The same pixel of the same image is the same scene point, so dense maps need no matching. A spread
 selection of confident pixels is as exact as all of them: 10,000 instead of 5.9 million for 30
-images. The solver is in ``irls``; ``from_tracks`` does the same for pieces with feature tracks.
+images. The solver is behind ``seen_points``; ``from_tracks`` does the same for pieces with feature tracks.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.alignment.irls import PieceFit, align_seen_points, evenly_chosen
+from smust3r_colmap.alignment.irls import PieceFit, evenly_chosen
+from smust3r_colmap.alignment.seen_points import align_seen_points
 from smust3r_colmap.confidence import reweighted
 from smust3r_colmap.config import AlignmentConfig, ConfidenceWeighting
 from smust3r_colmap.errors import DegenerateAlignmentError, ReconstructionError
@@ -113,6 +114,7 @@ def align_pointmaps(
             depth_target=on_target.depth,
             kernel=settings.robust_kernel,
             huber_delta=settings.huber_delta,
+            group=settings.transform_group,
             seed=seed,
         )
     except DegenerateAlignmentError as error:

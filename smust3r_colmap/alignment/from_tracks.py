@@ -2,7 +2,7 @@
 
 `align_tracks` needs shared images. `match_links` is the bridge between pieces that share none, or
 too few: a verified two-view match says that a feature here and a feature there are one point.
-The solver is in ``irls``; ``from_pointmaps`` does the same for dense maps.
+The solver is behind ``seen_points``; ``from_pointmaps`` does the same for dense maps.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.alignment.irls import PieceFit, align_seen_points
+from smust3r_colmap.alignment.irls import PieceFit
+from smust3r_colmap.alignment.seen_points import align_seen_points
 from smust3r_colmap.config import AlignmentConfig
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.products import SegmentPiece, Tracks
@@ -30,7 +31,7 @@ def align_tracks(target: SegmentPiece, source: SegmentPiece, settings: Alignment
     """Robust ``target_from_source`` from points that share an (image, feature) observation.
 
     Every pair of points counts once and weighs as many shared observations as it has, up to 5. With
-    the redescending kernels residuals are divided by the depth (see ``irls.align_seen_points``).
+    the redescending kernels residuals are divided by the depth (see ``seen_points``).
 
     Args:
         target, source: pieces with tracks.
@@ -126,6 +127,7 @@ def _align_point_pairs(
             depth_target=depth_target[usable],
             kernel=settings.robust_kernel,
             huber_delta=settings.huber_delta,
+            group=settings.transform_group,
             max_start_error=max_start_error,
             seed=seed,
         )

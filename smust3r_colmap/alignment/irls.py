@@ -1,15 +1,17 @@
-"""Robust Sim(3) between matched points: the one solver behind every kind of overlap (paper eq. 2).
+"""Robust transforms between matched points by iteratively reweighted least squares (paper eq. 2).
 
-Iteratively reweighted least squares: a closed-form similarity, residuals, new weights, again.
-Everything is computed in float64 about the centre of the data, and the default kernels take their
-scale from the residuals, so neither the unit of the scene nor its place matters.
-The modules ``from_tracks`` and ``from_pointmaps`` find the matched points.
+A fit, residuals, new weights, again: `fit_robustly` is the iteration for every group of transforms,
+and a `Refit` is the part that differs. This module has the one of Sim(3) and SE(3), ``affine`` that
+of Affine(3), ``projective`` that of SL(4). Everything is computed in float64 about the centre of the
+data, and the default kernels take their scale from the residuals, so neither the unit of the scene
+nor its place matters. The next module to read is ``seen_points``, which chooses among the groups.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +19,10 @@ import pycolmap
 
 from smust3r_colmap.config import RobustKernel
 from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3
-from smust3r_colmap.products import Sim3Estimate
+from smust3r_colmap.geometry.transform import Transform
+from smust3r_colmap.products import TransformEstimate
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -41,14 +45,13 @@ SCALE_FLOOR = 1e-10
 """Smallest kernel scale, relative to the extent of the data, so that exact data divides by no zero."""
 COLLINEAR_RATIO = 1e-6
 """Second over first singular value of the centred points below which they are a line."""
+BLOCK_ROWS = 65_536
+"""Rows whose Jacobians are in memory at a time: 24 MiB, however many points there are."""
 CONSENSUS_SAMPLE = 2000
 """Pairs among which the robust start is sought: 100 hypotheses then cost 2 ms, 1,000 cost 20 ms."""
 CONSENSUS_TRIALS = (100, 10_000)
 """Least and most hypotheses: 100 when nearly all pairs are right; 10,000 find one with 1 right pair in 10
 (three right ones come once in 1,000 draws)."""
-CONSENSUS_ERROR = 0.05
-"""Residual over depth that counts as agreement at the start: sound overlaps have medians up to 0.046,
-broken ones from 0.15 (six real image sets)."""
 
 
 def estimate_sim3(
@@ -61,8 +64,8 @@ def estimate_sim3(
     max_iterations: int | None = None,
     residual_scale: npt.ArrayLike | None = None,
     fixed_scale: bool = False,
-    start: Sim3 | None = None,
-) -> Sim3Estimate:
+    start: Transform | None = None,
+) -> TransformEstimate:
     """Robust ``b_from_a`` between matched points, by IRLS.
 
     ``cauchy`` and ``tukey`` redescend (a wrong pair loses its pull entirely) with a scale from the
@@ -82,13 +85,13 @@ def estimate_sim3(
         huber_delta: residual where Huber's loss turns linear, in units of b (after the division).
         max_iterations: of each kernel; None means 5 for huber and 100 otherwise.
         residual_scale: (N,) positive; residuals are divided by it (such as the depth). None: ones.
-        fixed_scale: keep the scale at 1 (SE(3)).
+        fixed_scale: keep the scale at 1: the estimate and its information are of SE(3).
         start: first guess; None is the closed form over all pairs.
 
     Returns:
         The estimate. Rows that are not finite, or whose residual scale is not positive, are dropped:
         they are missing in ``num_points``. ``rms`` and ``residual_sigma`` are of the divided
-        residuals. ``information`` takes rows as independent and is always of all seven parameters.
+        residuals. ``information`` takes rows as independent.
 
     Raises:
         DegenerateAlignmentError: fewer than 3 rows of positive weight, or these lie on a line or point.
@@ -96,40 +99,22 @@ def estimate_sim3(
 
     Source: Horn 1987 (closed form, symmetric scale); Holland and Welsch 1977 (IRLS).
     """
-    if kernel == "huber" and not huber_delta > 0:
-        raise ValueError(f"huber_delta {huber_delta} must be positive")
-    if max_iterations is None:
-        max_iterations = HUBER_ITERATIONS if kernel == "huber" else REDESCENDING_ITERATIONS
-    if max_iterations < 1:
-        raise ValueError(f"max_iterations {max_iterations} must be at least 1")
-    pairs = _usable_pairs(points_a, points_b, weights, residual_scale)
+    pairs = usable_pairs(points_a, points_b, weights, residual_scale, needed=3)
+    refit = _SimilarityRefit(fixed_scale=fixed_scale, squares_in_scale=kernel != "huber")
     equal = np.ones(len(pairs.weights))
-    fit = pairs.centred(start) if start is not None else _closed_form(pairs, equal, equal, fixed_scale=fixed_scale)
-    loss = _Loss(kernel=kernel, huber_delta=huber_delta)
-    iterations = 0
-    for stage in [_Loss(kernel="cauchy"), loss] if kernel == "tukey" else [loss]:
-        fit, done, stop_reason = _reweighted_fits(
-            pairs, fit, stage, max_iterations=max_iterations, fixed_scale=fixed_scale
-        )
-        iterations += done
-    residuals = pairs.residuals(fit)
-    sigma = pairs.sigma(residuals)
-    inliers = residuals <= 3 * sigma
-    return Sim3Estimate(
-        b_from_a=pairs.uncentred(fit),
-        num_points=len(residuals),
-        num_inliers=int(inliers.sum()),
-        rms=float(np.sqrt(np.mean(residuals[inliers] ** 2))),
-        residual_sigma=sigma,
-        iterations=iterations,
-        stop_reason=stop_reason,
-        information=_information(pairs, fit, residuals, loss.weights(residuals, sigma)),
+    return fit_robustly(
+        pairs,
+        refit(pairs, equal, np.eye(4)) if start is None else pairs.centred(start.matrix),
+        refit,
+        group=SE3 if fixed_scale else Sim3,
+        loss=Loss(kernel=kernel, huber_delta=huber_delta),
+        max_iterations=max_iterations,
     )
 
 
-# ------------------------------------------------------------------------- the iteration
+# ------------------------------------------------------------------------------ the data
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Pairs:
+class Pairs:
     """Usable rows about the centre of each side, where float64 has digits to spare.
 
     Args:
@@ -146,31 +131,44 @@ class _Pairs:
     weights: FloatArray
     residual_scale: FloatArray
 
-    def centred(self, b_from_a: Sim3) -> Sim3:
-        """The same transform between the centred frames."""
-        translation = b_from_a.apply(self.centre_a[None])[0] - self.centre_b
-        return Sim3(scale=b_from_a.scale, rotation=b_from_a.rotation, translation=translation)
+    def centred(self, b_from_a: FloatArray) -> FloatArray:
+        """(4, 4) the same transform between the centred frames, signed so that the centre has an image."""
+        fit: FloatArray = shift(-self.centre_b) @ b_from_a @ shift(self.centre_a)
+        return fit if fit[3, 3] > 0 else -fit
 
-    def uncentred(self, fit: Sim3) -> Sim3:
-        """The same transform between the frames of the caller."""
-        return _moved_origins(fit, self.centre_a, self.centre_b)
+    def uncentred(self, fit: FloatArray) -> FloatArray:
+        """(4, 4) the same transform between the frames of the caller."""
+        b_from_a: FloatArray = shift(self.centre_b) @ fit @ shift(-self.centre_a)
+        return b_from_a
 
-    def residuals(self, fit: Sim3) -> FloatArray:
-        """(N,) distances in frame b, divided."""
-        return point_distances(fit, self.points_a, self.points_b) / self.residual_scale
+    @property
+    def precision(self) -> FloatArray:
+        """(N,) weights of the undivided squared residuals."""
+        precision: FloatArray = self.weights / self.residual_scale**2
+        return precision
+
+    def residuals(self, fit: FloatArray) -> FloatArray:
+        """(N,) distances in frame b, divided; infinite where the fit has no image."""
+        residuals: FloatArray = np.linalg.norm(self.points_b - transformed(fit, self.points_a), axis=1)
+        return residuals / self.residual_scale
 
     def sigma(self, residuals: FloatArray) -> float:
         """Robust standard deviation of the residuals, at least the floor of the data.
 
         The median of all residuals, inflated by wrong pairs, would let them pull, move the fit and
         so inflate it further; a median of those within three standard deviations is not moved.
+
+        Raises:
+            DegenerateAlignmentError: most residuals are infinite.
         """
         order = np.argsort(residuals)
         rising, mass = residuals[order], np.cumsum(self.weights[order])
         num_near = len(rising)
         for _ in range(TRIMMING_ROUNDS):
-            median = rising[np.searchsorted(mass, 0.5 * mass[num_near - 1])]
-            sigma = max(MAD_TO_SIGMA * float(median), self.floor)
+            median = float(rising[np.searchsorted(mass, 0.5 * mass[num_near - 1])])
+            if not np.isfinite(median):
+                raise DegenerateAlignmentError(f"the fit sends most of {len(rising)} points to infinity or beyond")
+            sigma = max(MAD_TO_SIGMA * median, self.floor)
             num_near = int(np.searchsorted(rising, 3 * sigma, side="right"))
         return sigma
 
@@ -181,29 +179,48 @@ class _Pairs:
         return SCALE_FLOOR * float(extent)
 
 
-def _usable_pairs(
-    points_a: npt.ArrayLike, points_b: npt.ArrayLike, weights: npt.ArrayLike, residual_scale: npt.ArrayLike | None
-) -> _Pairs:
-    """Checked, filtered and centred input of `estimate_sim3`."""
-    a, b, w = (np.asarray(values, dtype=np.float64) for values in (points_a, points_b, weights))
-    scale = np.ones_like(w) if residual_scale is None else np.asarray(residual_scale, dtype=np.float64)
+def usable_pairs(
+    points_a: npt.ArrayLike,
+    points_b: npt.ArrayLike,
+    weights: npt.ArrayLike,
+    residual_scale: npt.ArrayLike | None,
+    *,
+    needed: int,
+    limit: int | None = None,
+) -> Pairs:
+    """Checked, filtered and centred input of an estimator.
+
+    Args:
+        points_a, points_b, weights, residual_scale: as for `estimate_sim3`.
+        needed: pairs that determine the transform.
+        limit: take at most so many of the usable rows, evenly; None takes all.
+
+    Raises:
+        DegenerateAlignmentError: fewer than that are usable, or the points of a side are one.
+        ValueError: shapes differ or a weight is negative.
+    """
+    a, b, w = (np.asarray(values) for values in (points_a, points_b, weights))
+    scale = np.broadcast_to(1.0, w.shape) if residual_scale is None else np.asarray(residual_scale)
     if a.ndim != 2 or a.shape[1] != 3 or a.shape != b.shape or w.shape != a.shape[:1] or scale.shape != w.shape:
         raise ValueError(f"points {a.shape} and {b.shape}, weights {w.shape}, residual_scale {scale.shape} do not fit")
     if (w < 0).any():
         raise ValueError(f"{int((w < 0).sum())} weights are negative")
-    finite = np.isfinite(np.column_stack([a, b, w, scale])).all(axis=1) & (scale > 0)
-    use = finite & (w > 0)
-    if use.sum() < 3:
+    finite = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1) & np.isfinite(w) & np.isfinite(scale) & (scale > 0)
+    use = np.flatnonzero(finite & (w > 0))
+    if len(use) < needed:
         raise DegenerateAlignmentError(
-            f"{int(use.sum())} of {len(w)} point pairs are usable ({int((~finite).sum())} are not finite); 3 are needed"
+            f"{len(use)} of {len(w)} point pairs are usable ({int((~finite).sum())} are not finite); "
+            f"{needed} are needed"
         )
-    a, b, w, scale = a[use], b[use], w[use], scale[use]
+    if limit is not None:
+        use = use[evenly_chosen(len(use), limit)]
+    a, b, w, scale = (values[use].astype(np.float64) for values in (a, b, w, scale))
     for side, points in (("first", a), ("second", b)):
         extent = float(np.ptp(points, axis=0).max())
         if extent <= SCALE_FLOOR * np.abs(points).max():
             raise DegenerateAlignmentError(f"all {len(points)} points of the {side} side are one (extent {extent:.1e})")
     centre_a, centre_b = a.mean(axis=0), b.mean(axis=0)
-    return _Pairs(
+    return Pairs(
         points_a=a - centre_a,
         points_b=b - centre_b,
         centre_a=centre_a,
@@ -213,70 +230,217 @@ def _usable_pairs(
     )
 
 
-def _moved_origins(centred: Sim3, centre_a: FloatArray, centre_b: FloatArray) -> Sim3:
-    """The transform between frames whose origins are not at these centres."""
-    translation = centred.translation + centre_b - centred.scale * centred.rotation @ centre_a
-    return Sim3(scale=centred.scale, rotation=centred.rotation, translation=translation)
+def shift(offset: FloatArray) -> FloatArray:
+    """(4, 4) translation by (3,)."""
+    out = np.eye(4)
+    out[:3, 3] = offset
+    return out
 
 
+def homogeneous(points: FloatArray) -> FloatArray:
+    """(..., 4) with a last coordinate of one."""
+    return np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)
+
+
+def transformed(b_from_a: FloatArray, points_a: FloatArray) -> FloatArray:
+    """(N, 3) images under a (4, 4) matrix; infinite for points on or behind its plane at infinity."""
+    images: FloatArray = points_a @ b_from_a[:3, :3].T + b_from_a[:3, 3]
+    if (b_from_a[3] == [0.0, 0.0, 0.0, 1.0]).all():
+        return images
+    depth = points_a @ b_from_a[3, :3] + b_from_a[3, 3]
+    front = depth > 0
+    images[front] /= depth[front, None]
+    images[~front] = np.inf
+    return images
+
+
+# ------------------------------------------------------------------------- the iteration
 @dataclass(frozen=True, kw_only=True)
-class _Loss:
-    """A kernel with its constant; what `estimate_sim3` says of both."""
+class Loss:
+    """A kernel with its constant; what `estimate_sim3` says of both.
+
+    Args:
+        kernel, huber_delta: as there.
+        squared: take the square of a redescending kernel's weight, for refits that see nothing but
+            products of two residuals (see ``affine``).
+    """
 
     kernel: RobustKernel
-    huber_delta: float = np.nan
+    huber_delta: float = 0.1
+    squared: bool = False
+
+    def __post_init__(self) -> None:
+        if self.kernel == "huber" and not self.huber_delta > 0:
+            raise ValueError(f"huber_delta {self.huber_delta} must be positive")
 
     def weights(self, residuals: FloatArray, sigma: float) -> FloatArray:
         """(N,) in [0, 1]: the derivative of the loss over the residual."""
         weights: FloatArray
         if self.kernel == "huber":
-            weights = self.huber_delta / np.maximum(residuals, self.huber_delta)
-        elif self.kernel == "tukey":
+            return self.huber_delta / np.maximum(residuals, self.huber_delta)
+        if self.kernel == "tukey":
             weights = np.maximum(1 - (residuals / (TUKEY_TUNING * sigma)) ** 2, 0.0) ** 2
         else:
             weights = 1 / (1 + (residuals / (CAUCHY_TUNING * sigma)) ** 2)
-        return weights
+        return weights**2 if self.squared else weights
 
-    def scale_weights(self, weights: FloatArray) -> FloatArray:
-        """(N,) the same weights as they enter the RMS radii."""
-        return weights if self.kernel == "huber" else weights**2
+    @property
+    def stages(self) -> tuple[Loss, ...]:
+        """Itself, and what has to converge before it."""
+        return (Loss(kernel="cauchy", squared=self.squared), self) if self.kernel == "tukey" else (self,)
+
+
+class Refit(Protocol):
+    """The part of the iteration that belongs to a group of transforms."""
+
+    def __call__(self, pairs: Pairs, kernel_weights: FloatArray, before: FloatArray) -> FloatArray:
+        """(4, 4) the fit between centred frames under the weights (N,) of the kernel.
+
+        Args:
+            pairs: the data. kernel_weights: (N,) in [0, 1].
+            before: (4, 4) the fit that the weights were taken from.
+
+        Raises:
+            DegenerateAlignmentError: the weighted points do not determine it.
+        """
+
+
+def fit_robustly(
+    pairs: Pairs,
+    start: FloatArray,
+    refit: Refit,
+    *,
+    group: type[Transform],
+    loss: Loss,
+    max_iterations: int | None,
+) -> TransformEstimate:
+    """Iterate ``refit`` under the weights of ``loss``, and collect the evidence.
+
+    Args:
+        pairs: the data. start: (4, 4) between the centred frames. refit: see there.
+        group: of the result and of its information.
+        loss: the kernel.
+        max_iterations: of each kernel; None means 5 for huber and 100 otherwise.
+
+    Raises:
+        DegenerateAlignmentError: from ``refit``.
+        ValueError: ``max_iterations`` is not positive.
+    """
+    if max_iterations is None:
+        max_iterations = HUBER_ITERATIONS if loss.kernel == "huber" else REDESCENDING_ITERATIONS
+    if max_iterations < 1:
+        raise ValueError(f"max_iterations {max_iterations} must be at least 1")
+    fit, iterations = start, 0
+    for stage in loss.stages:
+        fit, done, stop_reason = _reweighted_fits(pairs, fit, refit, stage, max_iterations=max_iterations)
+        iterations += done
+    residuals = pairs.residuals(fit)
+    sigma = pairs.sigma(residuals)
+    inliers = residuals <= 3 * sigma
+    return TransformEstimate(
+        b_from_a=group.from_matrix(pairs.uncentred(fit)),
+        num_points=len(residuals),
+        num_inliers=int(inliers.sum()),
+        rms=float(np.sqrt(np.mean(residuals[inliers] ** 2))),
+        residual_sigma=sigma,
+        iterations=iterations,
+        stop_reason=stop_reason,
+        information=_information(group, pairs, fit, residuals, loss.weights(residuals, sigma)),
+    )
 
 
 def _reweighted_fits(
-    pairs: _Pairs, fit: Sim3, loss: _Loss, *, max_iterations: int, fixed_scale: bool
-) -> tuple[Sim3, int, str]:
+    pairs: Pairs, fit: FloatArray, refit: Refit, loss: Loss, *, max_iterations: int
+) -> tuple[FloatArray, int, str]:
     """Fit again with the kernel's weights until the points rest: fit, iterations, why it stopped."""
     for iteration in range(1, max_iterations + 1):
         residuals = pairs.residuals(fit)
         sigma = pairs.sigma(residuals)
         weights = loss.weights(residuals, sigma)
-        before, fit = fit, _closed_form(pairs, weights, loss.scale_weights(weights), fixed_scale=fixed_scale)
-        moved = point_distances(fit, pairs.points_a, before.apply(pairs.points_a)) / pairs.residual_scale
-        if np.sqrt(np.mean(moved**2)) <= CONVERGED_MOTION * sigma:
+        before, fit = fit, refit(pairs, weights, fit)
+        # Points that the kernel has dropped may lie at infinity.
+        kept = weights > 0
+        moved = transformed(fit, pairs.points_a[kept]) - transformed(before, pairs.points_a[kept])
+        motion = (moved**2).sum(axis=1) / pairs.residual_scale[kept] ** 2
+        if np.sqrt(np.mean(motion)) <= CONVERGED_MOTION * sigma:
             return fit, iteration, "converged"
     return fit, max_iterations, "iteration limit"
 
 
-def _closed_form(pairs: _Pairs, kernel_weights: FloatArray, scale_weights: FloatArray, *, fixed_scale: bool) -> Sim3:
+# --------------------------------------------------------------------- its uncertainty
+def _information(
+    group: type[Transform], pairs: Pairs, fit: FloatArray, residuals: FloatArray, kernel_weights: FloatArray
+) -> FloatArray:
+    """(d, d) Gauss-Newton normal matrix over the variance of one component of a residual of weight 1."""
+    weights = pairs.weights * kernel_weights
+    used = weights > 0
+    normal = np.zeros((group.DOF, group.DOF))
+    for jacobian, rows in right_jacobians(group, pairs.uncentred(fit), pairs.points_a[used] + pairs.centre_a):
+        share = (weights[used][rows] / pairs.residual_scale[used][rows] ** 2)[:, None, None]
+        normal += np.tensordot(share * jacobian, jacobian, axes=((0, 1), (0, 1)))
+    degrees_of_freedom = max(3 * float(kernel_weights.sum()) - group.DOF, 1.0)
+    variance = float(weights[used] @ residuals[used] ** 2) / degrees_of_freedom
+    information: FloatArray = normal / max(variance, pairs.floor**2)
+    return information
+
+
+def right_jacobians(
+    group: type[Transform], b_from_a: FloatArray, points_a: FloatArray
+) -> Iterator[tuple[FloatArray, slice]]:
+    """Derivative (n, 3, d) of ``(b_from_a @ exp(delta)).apply(points_a)`` at 0, by blocks, with their rows.
+
+    With h the homogeneous point, b_from_a h = (y, w) and p = y / w, the image of M = b_from_a hat(delta) h
+    is (M_123 - p M_4) / w. It is linear in the products of a row of b_from_a, reduced so, with h.
+
+    Args:
+        group: whose tangent delta is. b_from_a: (4, 4). points_a: (N, 3) with an image.
+    """
+    generators = group.hat(np.eye(group.DOF)).reshape(group.DOF, 16).T
+    for first in range(0, len(points_a), BLOCK_ROWS):
+        rows = slice(first, min(first + BLOCK_ROWS, len(points_a)))
+        points = homogeneous(points_a[rows])
+        image = points @ b_from_a.T
+        depth = image[:, 3, None, None]
+        reduced = (b_from_a[:3] - (image[:, :3] / image[:, 3:])[:, :, None] * b_from_a[3]) / depth  # (n, 3, 4)
+        products = (reduced[:, :, :, None] * points[:, None, None, :]).reshape(-1, 16)
+        yield (products @ generators).reshape(-1, 3, group.DOF), rows
+
+
+# --------------------------------------------------------------------- Sim(3) and SE(3)
+@dataclass(frozen=True, kw_only=True)
+class _SimilarityRefit:
     """Weighted least squares of the divided residuals, with the symmetric scale.
 
-    Raises:
-        DegenerateAlignmentError: the weighted points of a side lie on a line or in a point.
+    Args:
+        fixed_scale: keep the scale at 1.
+        squares_in_scale: the kernel's weights enter the RMS radii squared.
     """
-    precision = pairs.weights / pairs.residual_scale**2
-    share = precision * kernel_weights
-    share = share / share.sum()
-    mean_a, mean_b = share @ pairs.points_a, share @ pairs.points_b
-    a, b = pairs.points_a - mean_a, pairs.points_b - mean_b
-    _check_spread(a, share, "first")
-    _check_spread(b, share, "second")
-    u, _, vt = np.linalg.svd((share[:, None] * b).T @ a)
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    scale = 1.0
-    if not fixed_scale:
-        in_scale = precision * scale_weights
-        scale = float(np.sqrt(in_scale @ (b**2).sum(axis=1)) / np.sqrt(in_scale @ (a**2).sum(axis=1)))
-    return Sim3(scale=np.array(scale), rotation=rotation, translation=mean_b - scale * rotation @ mean_a)
+
+    fixed_scale: bool
+    squares_in_scale: bool
+
+    def __call__(self, pairs: Pairs, kernel_weights: FloatArray, before: FloatArray) -> FloatArray:
+        """As `Refit`; refuses weighted points of a side that lie on a line or in a point."""
+        precision = pairs.precision
+        share = precision * kernel_weights
+        share = share / share.sum()
+        mean_a, mean_b = share @ pairs.points_a, share @ pairs.points_b
+        a, b = pairs.points_a - mean_a, pairs.points_b - mean_b
+        _check_spread(a, share, "first")
+        _check_spread(b, share, "second")
+        u, _, vt = np.linalg.svd((share[:, None] * b).T @ a)
+        linear = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        if not self.fixed_scale:
+            in_scale = precision * kernel_weights ** (2 if self.squares_in_scale else 1)
+            linear *= np.sqrt(in_scale @ (b**2).sum(axis=1)) / np.sqrt(in_scale @ (a**2).sum(axis=1))
+        return affine_matrix(linear, mean_b - linear @ mean_a)
+
+
+def affine_matrix(linear: FloatArray, translation: FloatArray) -> FloatArray:
+    """(4, 4) of (3, 3) and (3,)."""
+    out = shift(translation)
+    out[:3, :3] = linear
+    return out
 
 
 def _check_spread(centred: FloatArray, share: FloatArray, side: str) -> None:
@@ -290,44 +454,6 @@ def _check_spread(centred: FloatArray, share: FloatArray, side: str) -> None:
         )
 
 
-def _information(pairs: _Pairs, fit: Sim3, residuals: FloatArray, kernel_weights: FloatArray) -> FloatArray:
-    """(7, 7) Gauss-Newton normal matrix over the variance of one component of a residual of weight 1.
-
-    With x in frame a, ``b_from_a @ exp(delta)`` moves its image by s R (u + omega x x + lambda x) for
-    delta = (u, omega, lambda), so the normal matrix is a matter of the moments of x; R cancels.
-    """
-    points_a = pairs.points_a + pairs.centre_a
-    weights = pairs.weights * kernel_weights
-    share = weights / pairs.residual_scale**2
-    mass = float(share.sum())
-    first = share @ points_a
-    second = (share[:, None] * points_a).T @ points_a
-    normal = np.zeros((7, 7))
-    normal[:3, :3] = mass * np.eye(3)
-    normal[:3, 3:6] = _cross_matrix(-first)
-    normal[3:6, :3] = _cross_matrix(first)
-    normal[:3, 6] = normal[6, :3] = first
-    normal[3:6, 3:6] = np.trace(second) * np.eye(3) - second
-    normal[6, 6] = np.trace(second)
-    degrees_of_freedom = max(3 * float(kernel_weights.sum()) - 7, 1.0)
-    variance = float(weights @ residuals**2) / degrees_of_freedom
-    information: FloatArray = float(fit.scale) ** 2 * normal / max(variance, pairs.floor**2)
-    return information
-
-
-def _cross_matrix(vector: FloatArray) -> FloatArray:
-    """(3, 3) with ``_cross_matrix(v) @ x == cross(v, x)``."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
-def point_distances(b_from_a: Sim3, points_a: FloatArray, points_b: FloatArray) -> FloatArray:
-    """(N,) distances in frame b between transformed and given points."""
-    distances: FloatArray = np.linalg.norm(points_b - b_from_a.apply(points_a), axis=1)
-    return distances
-
-
-# ------------------------------------------------------------ correspondences with depths
 def consensus_sim3(points_a: FloatArray, points_b: FloatArray, *, max_error: float, seed: int = 0) -> Sim3:
     """``b_from_a`` on which most pairs agree, by LO-RANSAC; a start that wrong pairs do not spoil.
 
@@ -353,7 +479,8 @@ def consensus_sim3(points_a: FloatArray, points_b: FloatArray, *, max_error: flo
         raise DegenerateAlignmentError(
             f"no transform puts 3 of {len(points_a)} point pairs within {max_error:.3g}, or they lie on a line"
         )
-    return _moved_origins(Sim3.from_matrix(found["tgt_from_src"].matrix()), origin_a, origin_b)
+    near_origin = Sim3.from_matrix(found["tgt_from_src"].matrix()).matrix
+    return Sim3.from_matrix(shift(origin_b) @ near_origin @ shift(-origin_a))
 
 
 def _off_plane(points: FloatArray) -> FloatArray:
@@ -362,6 +489,13 @@ def _off_plane(points: FloatArray) -> FloatArray:
     variances, axes = np.linalg.eigh(np.cov(points - centre, rowvar=False))
     origin: FloatArray = centre - np.sqrt(max(variances[2], 0.0)) * axes[:, 0]
     return origin
+
+
+# ------------------------------------------------------------------------ for the callers
+def point_distances(b_from_a: Transform, points_a: FloatArray, points_b: FloatArray) -> FloatArray:
+    """(N,) distances in frame b between transformed and given points; infinite where there is no image."""
+    distances = np.linalg.norm(points_b - b_from_a.apply(points_a), axis=1)
+    return np.where(np.isnan(distances), np.inf, distances)
 
 
 def evenly_chosen(count: int, limit: int) -> npt.NDArray[np.int64]:
@@ -377,60 +511,15 @@ class PieceFit:
         estimate: the transform and the evidence of the solver.
         num_correspondences: pairs of points found, before any was left out as wrong.
         relative_residual: median over all of them of the residual divided by the depth.
+        fallback: why the transform is of Sim(3) although a larger group was asked for, or empty.
     """
 
-    estimate: Sim3Estimate
+    estimate: TransformEstimate
     num_correspondences: int
     relative_residual: float
+    fallback: str = ""
 
     @property
     def inlier_share(self) -> float:
         """Share of the pairs found that lie within three robust standard deviations."""
         return self.estimate.num_inliers / self.num_correspondences
-
-
-def align_seen_points(
-    points_source: FloatArray,
-    points_target: FloatArray,
-    weights: FloatArray,
-    *,
-    depth_source: FloatArray,
-    depth_target: FloatArray,
-    kernel: RobustKernel,
-    huber_delta: float,
-    max_start_error: float = np.inf,
-    seed: int = 0,
-) -> PieceFit:
-    """Robust ``target_from_source`` of points that cameras saw at known depths.
-
-    ``cauchy`` and ``tukey`` divide the residual by the depth, since the error of a point grows with
-    it, and start from a consensus: from the plain start they are lost from 40 % coherent wrong pairs
-    on. The depth is the geometric mean of both sides, for the depth of one side gives more weight to
-    points which that side has too near, and a bias to the scale. ``huber`` is the method of the
-    paper: plain residuals, plain start.
-
-    Args:
-        points_source, points_target: (N, 3) finite; equal rows are the same scene point.
-        weights: (N,) non-negative.
-        depth_source, depth_target: (N,) positive, each in units of its own frame.
-        kernel, huber_delta: as for `estimate_sim3`.
-        max_start_error: pairs further apart at the consensus, divided by the depth, are left out.
-        seed: of the consensus.
-
-    Raises:
-        DegenerateAlignmentError: the points do not determine the transform, or agree on none.
-    """
-    if len(weights) < 3:
-        raise DegenerateAlignmentError(f"{len(weights)} point pairs; 3 are needed")
-    depth = np.sqrt(depth_target * depth_source * np.median(depth_target / depth_source))
-    if kernel == "huber":
-        estimate = estimate_sim3(points_source, points_target, weights, kernel=kernel, huber_delta=huber_delta)
-    else:
-        max_error = CONSENSUS_ERROR * float(np.median(depth))
-        start = consensus_sim3(points_source, points_target, max_error=max_error, seed=seed)
-        plausible = point_distances(start, points_source, points_target) <= max_start_error * depth
-        estimate = estimate_sim3(
-            points_source, points_target, weights * plausible, kernel=kernel, residual_scale=depth, start=start
-        )
-    relative = point_distances(estimate.b_from_a, points_source, points_target) / depth
-    return PieceFit(estimate=estimate, num_correspondences=len(weights), relative_residual=float(np.median(relative)))
