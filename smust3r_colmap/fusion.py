@@ -1,8 +1,10 @@
-"""From chained pieces to one scene: every image one pose, every camera one calibration, one cloud.
+"""From placed pieces to one scene: every image one pose, every camera one calibration, one cloud.
 
 Pieces overlap, so most images were reconstructed twice. Their poses are averaged, calibrations are
 voted on, and of the dense maps one per image is used, hung on the averaged pose so that cloud and
-cameras agree. All of it takes values and returns values; maps are read one image at a time.
+cameras agree. Pieces of loop segments only speak for images that no window piece holds: they are made
+of two short runs of the sequence, and their work is done in the graph.
+All of it takes values and returns values; maps are read one image at a time.
 The next modules to read are the exporters.
 """
 
@@ -17,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from smust3r_colmap.geometry.camera import Intrinsics
-from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
+from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import (
     DenseMaps,
     FloatArray,
@@ -25,8 +27,8 @@ from smust3r_colmap.products import (
     IntArray,
     PointCloud,
     Scene,
-    SegmentPiece,
 )
+from smust3r_colmap.resection import PlacedPiece
 
 OUTLIER_RATIO = 5.0
 """A pose is left out beyond this many times the usual disagreement of its two pieces. Drift that grows
@@ -41,6 +43,9 @@ DEPTH_JUMP = 0.1
 """Neighbours whose depths differ by more than this part belong to two surfaces and give no normal."""
 NO_NORMAL_WEIGHT = 1e-3
 """Weight of the viewing direction where a pixel has no normal: it counts where nothing else does."""
+LONGEST_HOLE = 5
+"""Images missing in a row that do not end a run: a few blurred frames do not take an image's
+neighbours away, but the two sides of a loop are no neighbours."""
 
 _CELL_BITS = 21  # three axes of 21 bits fill an int64 without its sign
 
@@ -53,12 +58,13 @@ class FusedCameras:
     Args:
         images: (N,) indices into the collection, ascending.
         cam_from_world: (N, 3, 4) rigid.
-        num_pieces: (N,) pieces that hold the image.
+        num_pieces: (N,) pieces that speak for the image: the windows that hold it, else the loop pieces.
         num_dropped: (N,) of these, poses left out because they disagree with the rest.
         best_piece: (N,) position of the piece, among those used, where the image lies most central.
         position_spread: (N,) largest distance between two pieces' centres of the image, as a part of
             ``scene_radius``; dropped poses count too; NaN where one piece holds the image.
         rotation_spread_deg: (N,) the same for the rotations, in degrees.
+        residual_px: (N,) of the image's camera in its best piece, see ``PlacedPiece``.
         scene_radius: median distance of the camera centres from their median, in world units.
     """
 
@@ -69,11 +75,13 @@ class FusedCameras:
     best_piece: IntArray
     position_spread: FloatArray
     rotation_spread_deg: FloatArray
+    residual_px: FloatArray
     scene_radius: float
 
     def __post_init__(self) -> None:
         n = len(self.images)
-        for name in ("num_pieces", "num_dropped", "best_piece", "position_spread", "rotation_spread_deg"):
+        counts = ("num_pieces", "num_dropped", "best_piece")
+        for name in (*counts, "position_spread", "rotation_spread_deg", "residual_px"):
             if getattr(self, name).shape != (n,):
                 raise ValueError(f"FusedCameras: {n} images, {name} {getattr(self, name).shape}")
         if self.cam_from_world.shape != (n, 3, 4) or not np.isfinite(self.cam_from_world).all():
@@ -98,7 +106,7 @@ class _Sightings:
         return distances, angles_deg
 
 
-def fuse_cameras(pieces: Sequence[SegmentPiece], world_from_seg: Sequence[Sim3]) -> FusedCameras:
+def fuse_cameras(pieces: Sequence[PlacedPiece]) -> FusedCameras:
     """One pose per image: centres by weighted mean, rotations by weighted chordal mean.
 
     The weight is the image's ``centrality`` in each piece, so through an overlap the trajectory passes
@@ -110,16 +118,16 @@ def fuse_cameras(pieces: Sequence[SegmentPiece], world_from_seg: Sequence[Sim3])
     every image they share are blended all the same, and the spread tells.
 
     Args:
-        pieces: of one connected part.
-        world_from_seg: one per piece.
+        pieces: of one connected part, placed in its world.
 
     Raises:
-        ValueError: no piece, or another number of transforms than of pieces.
+        ValueError: no piece.
 
     Source: chordal mean after Hartley, Trumpf, Dai and Li, Rotation Averaging, IJCV 2013.
     """
-    _check_one_each(pieces, world_from_seg)
-    sightings = _sightings_by_image(pieces, world_from_seg)
+    if not pieces:
+        raise ValueError("fusion: no piece, needed at least one")
+    sightings = _sightings_by_image(pieces)
     centres = np.concatenate([sighting.world_from_cam[:, :, 3] for sighting in sightings.values()])
     radius = float(np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
     usual = _usual_disagreement(sightings.values(), radius)
@@ -133,45 +141,62 @@ def fuse_cameras(pieces: Sequence[SegmentPiece], world_from_seg: Sequence[Sim3])
             for sighting, keep in zip(sightings.values(), kept, strict=True)
         ]
     )
+    best_piece = np.array(
+        [
+            sighting.pieces[int(np.argmax(np.where(keep, sighting.weights, 0)))]
+            for sighting, keep in zip(sightings.values(), kept, strict=True)
+        ]
+    )
     return FusedCameras(
         images=tuple(sightings),
         cam_from_world=invert_rigid(world_from_cam),
         num_pieces=np.array([len(keep) for keep in kept]),
         num_dropped=np.array([np.count_nonzero(~keep) for keep in kept]),
-        best_piece=np.array(
-            [
-                sighting.pieces[int(np.argmax(np.where(keep, sighting.weights, 0)))]
-                for sighting, keep in zip(sightings.values(), kept, strict=True)
-            ]
-        ),
+        best_piece=best_piece,
         position_spread=np.where(alone, np.nan, distance / radius if radius > 0 else distance),
         rotation_spread_deg=np.where(alone, np.nan, angle_deg),
+        residual_px=np.array(
+            [
+                pieces[best].residual_px[pieces[best].piece.images.index(image)]
+                for image, best in zip(sightings, best_piece, strict=True)
+            ]
+        ),
         scene_radius=radius,
     )
 
 
-def centrality(num_images: int) -> FloatArray:
-    """(N,) weight of each image of a piece, in (0, 1]: falls linearly from the middle to the ends.
+def centrality(images: Sequence[int]) -> FloatArray:
+    """(N,) weight of each image of a piece, in (0, 1]: falls linearly from the middle of its run to the ends.
 
-    An image in the middle of a segment has neighbours on both sides, one at its end on one side only.
+    An image in the middle of a run has neighbours on both sides, one at its end on one side only. A
+    run ends where more than ``LONGEST_HOLE`` images are missing.
+
+    Args:
+        images: indices into the collection, ascending.
     """
-    to_end = np.minimum(np.arange(num_images), np.arange(num_images)[::-1]) + 1
+    ends = np.flatnonzero(np.diff(images) > LONGEST_HOLE + 1) + 1
+    runs = [np.arange(len(run)) for run in np.split(np.asarray(images), ends)]
+    to_end = np.concatenate([np.minimum(run, run[::-1]) + 1 for run in runs])
     weights: FloatArray = to_end / to_end.max()
     return weights
 
 
-def _check_one_each(pieces: Sequence[SegmentPiece], others: Sequence[object]) -> None:
-    if not pieces or len(pieces) != len(others):
-        raise ValueError(f"fusion: {len(pieces)} pieces and {len(others)} companions; needed one each, at least one")
+def speaking_images(pieces: Sequence[PlacedPiece]) -> list[npt.NDArray[np.bool_]]:
+    """Per piece, (N,) for which of its images it counts: all of a window's, of a loop's those no window holds."""
+    in_windows = {image for placed in pieces if not placed.is_loop for image in placed.piece.images}
+    return [
+        np.array([not (placed.is_loop and image in in_windows) for image in placed.piece.images], dtype=np.bool_)
+        for placed in pieces
+    ]
 
 
-def _sightings_by_image(pieces: Sequence[SegmentPiece], world_from_seg: Sequence[Sim3]) -> dict[int, _Sightings]:
-    """Per image, ascending, what each piece that holds it says."""
+def _sightings_by_image(pieces: Sequence[PlacedPiece]) -> dict[int, _Sightings]:
+    """Per image, ascending, what each piece that speaks for it says."""
     found: dict[int, list[tuple[int, FloatArray, float]]] = defaultdict(list)
-    for position, (piece, world_from) in enumerate(zip(pieces, world_from_seg, strict=True)):
-        poses = world_from.move_cameras(piece.seg_from_cam)
-        for image, pose, weight in zip(piece.images, poses, centrality(len(piece.images)), strict=True):
-            found[image].append((position, pose, weight))
+    for position, (placed, speaks) in enumerate(zip(pieces, speaking_images(pieces), strict=True)):
+        weights = centrality(placed.piece.images)
+        for k in np.flatnonzero(speaks):
+            found[placed.piece.images[k]].append((position, placed.world_from_cam[k], weights[k]))
     return {
         image: _Sightings(
             pieces=tuple(position for position, _, _ in found[image]),
@@ -222,11 +247,11 @@ def _mean_pose(world_from_cam: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 # ------------------------------------------------------------------------- intrinsics
-def fuse_intrinsics(pieces: Sequence[SegmentPiece], camera_of_image: Sequence[int]) -> dict[int, Intrinsics]:
+def fuse_intrinsics(pieces: Sequence[PlacedPiece], camera_of_image: Sequence[int]) -> dict[int, Intrinsics]:
     """One calibration per camera: the median of each parameter over all registered images.
 
-    A piece counts as often as it registered an image of the camera. Where pieces disagree about the
-    camera model, the model of most images is taken and the others have no say.
+    A piece counts as often as it speaks for an image of the camera (``speaking_images``). Where pieces
+    disagree about the camera model, the model of most images is taken and the others have no say.
 
     Args:
         pieces: of one connected part, intrinsics at the original image size.
@@ -239,9 +264,9 @@ def fuse_intrinsics(pieces: Sequence[SegmentPiece], camera_of_image: Sequence[in
         ValueError: two pieces hold one camera at different image sizes.
     """
     found: dict[int, list[Intrinsics]] = defaultdict(list)
-    for piece in pieces:
-        for image, intrinsics in zip(piece.images, piece.intrinsics, strict=True):
-            found[camera_of_image[image]].append(intrinsics)
+    for placed, speaks in zip(pieces, speaking_images(pieces), strict=True):
+        for k in np.flatnonzero(speaks):
+            found[camera_of_image[placed.piece.images[k]]].append(placed.piece.intrinsics[k])
     return {camera: _median_intrinsics(camera, found[camera]) for camera in sorted(found)}
 
 
@@ -327,9 +352,8 @@ class _Surface:
 
 
 def fuse_points(
-    pieces: Sequence[SegmentPiece],
+    pieces: Sequence[PlacedPiece],
     dense: Sequence[DenseMaps],
-    world_from_seg: Sequence[Sim3],
     cameras: FusedCameras,
     *,
     max_points: int,
@@ -337,11 +361,11 @@ def fuse_points(
 ) -> FusedPoints:
     """The confident pixels of all maps as one cloud, averaged over the cells of a regular grid.
 
-    Each image gives its map once, from ``cameras.best_piece``. The pointmap is taken into the camera
-    by the pose that the piece itself gave the image, scaled by the piece's ``world_from_seg``, and
-    placed by the *fused* pose. For maps that are depth unprojected this is depth times scale along the
-    rays of the piece's own intrinsics (those made the depth, the fused ones did not); maps that carry
-    more than depth keep it.
+    Each image gives its map once, from ``cameras.best_piece``. The pointmap goes into the world by the
+    piece's transform, into the camera by the pose that the piece itself placed there, and back into
+    the world by the *fused* pose. For maps that are depth unprojected, under a similarity, this is depth
+    times scale along the rays of the piece's own intrinsics (those made the depth, the fused ones did
+    not); maps that carry more than depth keep it, and a transform that bends them bends the cloud.
 
     Cells start at the usual distance of neighbouring pixels and grow until ``max_points`` suffice.
     Cells that one image only saw are dropped where at least half of the cloud stays. Normals come from
@@ -351,22 +375,22 @@ def fuse_points(
     Memory: about 100 bytes x ``SAMPLES_PER_POINT`` x ``max_points``, and one image's maps.
 
     Args:
-        pieces, dense, world_from_seg: one each, of one connected part.
+        pieces, dense: one each, of one connected part.
         cameras: ``fuse_cameras`` of the same pieces.
         max_points: upper bound of the cloud, at least 1.
         min_confidence: pixels below are left out.
 
     Raises:
-        ValueError: numbers of pieces, maps and transforms differ, or ``max_points`` is below 1.
+        ValueError: numbers of pieces and maps differ, or ``max_points`` is below 1.
     """
-    _check_one_each(pieces, dense)
-    _check_one_each(pieces, world_from_seg)
+    if len(pieces) != len(dense):
+        raise ValueError(f"fusion: {len(pieces)} pieces and {len(dense)} sets of maps; needed one each")
     if max_points < 1:
         raise ValueError(f"max_points is {max_points}, needed at least 1")
     quota = -(-SAMPLES_PER_POINT * max_points // len(cameras.images))
     origin = np.median(invert_rigid(cameras.cam_from_world)[:, :, 3], axis=0)
     samples, spacing, num_pixels = _gathered(
-        pieces, dense, world_from_seg, cameras, origin=origin, quota=quota, min_confidence=min_confidence
+        pieces, dense, cameras, origin=origin, quota=quota, min_confidence=min_confidence
     )
     if not len(samples):
         return FusedPoints(
@@ -416,10 +440,13 @@ def _unit(vectors: FloatArray) -> FloatArray:
     return unit
 
 
-def _surface(maps: DenseMaps, k: int, seg_from_cam: FloatArray, scale: float, min_confidence: float) -> _Surface:
-    """Image ``k`` of a piece, moved from the segment into its camera and scaled to the world."""
-    cam_from_seg = invert_rigid(seg_from_cam)
-    points_cam = scale * (maps.pointmap_seg(k) @ cam_from_seg[:, :3].T + cam_from_seg[:, 3])
+def _surface(placed: PlacedPiece, maps: DenseMaps, k: int, min_confidence: float) -> _Surface:
+    """Image ``k`` of a piece, moved from the segment through the world into its camera there."""
+    pointmap_seg = maps.pointmap_seg(k)
+    cam_from_world = invert_rigid(placed.world_from_cam[k])
+    with np.errstate(invalid="ignore", divide="ignore"):  # a projective transform has a plane at infinity
+        points_world = placed.world_from_seg.apply(pointmap_seg.reshape(-1, 3))
+        points_cam = (points_world @ cam_from_world[:, :3].T + cam_from_world[:, 3]).reshape(pointmap_seg.shape)
     confident = np.isfinite(points_cam).all(axis=-1) & (maps.confidence(k) >= min_confidence)
     confident &= np.nan_to_num(points_cam[..., 2]) > 0
     to_neighbour = np.linalg.norm(np.diff(points_cam, axis=1), axis=-1)[confident[:, 1:]]
@@ -433,9 +460,8 @@ def _surface(maps: DenseMaps, k: int, seg_from_cam: FloatArray, scale: float, mi
 
 
 def _gathered(
-    pieces: Sequence[SegmentPiece],
+    pieces: Sequence[PlacedPiece],
     dense: Sequence[DenseMaps],
-    world_from_seg: Sequence[Sim3],
     cameras: FusedCameras,
     *,
     origin: FloatArray,
@@ -446,9 +472,7 @@ def _gathered(
     parts, spacings, num_pixels = [], [], 0
     world_from_cam = invert_rigid(cameras.cam_from_world)
     for image, best, pose in zip(cameras.images, cameras.best_piece, world_from_cam, strict=True):
-        k = pieces[best].images.index(image)
-        scale = float(world_from_seg[best].scale)
-        surface = _surface(dense[best], k, pieces[best].seg_from_cam[k], scale, min_confidence)
+        surface = _surface(pieces[best], dense[best], pieces[best].piece.images.index(image), min_confidence)
         parts.append(surface.sampled(quota, image, pose, origin))
         spacings += [surface.spacing] if np.isfinite(surface.spacing) else []
         num_pixels += len(surface.points_cam)
@@ -522,7 +546,7 @@ def _averaged(samples: _Samples, cells: IntArray, origin: FloatArray) -> tuple[P
 # ------------------------------------------------------------------------------ scene
 def build_scene(
     collection: ImageCollection,
-    pieces: Sequence[SegmentPiece],
+    pieces: Sequence[PlacedPiece],
     cameras: FusedCameras,
     intrinsics: dict[int, Intrinsics],
     points: PointCloud,
@@ -533,7 +557,7 @@ def build_scene(
 
     Args:
         collection: all images of the run.
-        pieces: of this connected part; the first is the world frame.
+        pieces: of this connected part; the first is the world frame. Pieces of loops are named too.
         cameras, intrinsics, points: what the three fusions made of them.
         metric: lengths are metres.
     """
@@ -546,5 +570,5 @@ def build_scene(
         cam_from_world=cameras.cam_from_world,
         points=points,
         metric=metric,
-        segments=tuple(piece.name for piece in pieces),
+        segments=tuple(placed.piece.name for placed in pieces),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,9 +21,13 @@ from smust3r_colmap.fusion import (
     fuse_points,
     surface_normals,
 )
+from smust3r_colmap.geometry.affine3 import Affine3
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres, pointmap_from_depth
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
+from smust3r_colmap.geometry.sl4 import SL4
+from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import DenseMaps, FloatArray, ImageCollection, SegmentPiece, SourceImage
+from smust3r_colmap.resection import PlacedPiece, place_piece
 
 CAMERA = Intrinsics(model="SIMPLE_RADIAL", width=640, height=480, params=(600, 320, 240, -0.05))
 NUM_IMAGES = 14
@@ -84,18 +88,22 @@ class MapsInMemory:
 class World:
     world_from_cam: FloatArray
     pieces: list[SegmentPiece]
-    world_from_seg: list[Sim3]
+    world_from_seg: Sequence[Transform]
     dense: list[MapsInMemory]
 
+    def placed(self, loops: Collection[int] = ()) -> list[PlacedPiece]:
+        """The pieces in the world; those at the positions ``loops`` are of loop segments."""
+        parts = zip(self.pieces, self.dense, self.world_from_seg, strict=True)
+        return [place_piece(*part, is_loop=position in loops) for position, part in enumerate(parts)]
+
     def cameras(self) -> FusedCameras:
-        return fuse_cameras(self.pieces, self.world_from_seg)
+        return fuse_cameras(self.placed())
 
     def points(self, *, max_points: int = 20_000, min_confidence: float = 2.0) -> FusedPoints:
         maps: Sequence[DenseMaps] = self.dense
         return fuse_points(
-            self.pieces,
+            self.placed(),
             maps,
-            self.world_from_seg,
             self.cameras(),
             max_points=max_points,
             min_confidence=min_confidence,
@@ -126,7 +134,6 @@ def make_piece(segment: int, images: Sequence[int], seg_from_cam: FloatArray) ->
         method="made up",
         reprojection_error_px=float("nan"),
         tracks=None,
-        descriptors=np.ones((len(images), 1), dtype=np.float32),
     )
 
 
@@ -160,10 +167,16 @@ def moved(world: World, piece: int, image: int, shift: Sequence[float], turn_deg
     return replace(world, pieces=pieces)
 
 
+def shifted_by(world_from_seg: Transform, shift: FloatArray) -> Sim3:
+    matrix = world_from_seg.matrix
+    matrix[:3, 3] += shift
+    return Sim3.from_matrix(matrix)
+
+
 def shifted(world: World, piece: int, shift: Sequence[float]) -> World:
     """The same world, where the whole of one piece is off by a shift in world units."""
     world_from_seg = list(world.world_from_seg)
-    world_from_seg[piece] = replace(world_from_seg[piece], translation=world_from_seg[piece].translation + shift)
+    world_from_seg[piece] = shifted_by(world_from_seg[piece], np.asarray(shift))
     return replace(world, world_from_seg=world_from_seg)
 
 
@@ -186,9 +199,16 @@ def test_exact_pieces_give_back_the_exact_cameras() -> None:
 
 
 def test_weights_fall_to_the_ends_of_a_piece() -> None:
-    np.testing.assert_allclose(centrality(5), [1 / 3, 2 / 3, 1, 2 / 3, 1 / 3])
-    np.testing.assert_allclose(centrality(4), [0.5, 1, 1, 0.5])
-    np.testing.assert_allclose(centrality(1), [1])
+    np.testing.assert_allclose(centrality(range(5)), [1 / 3, 2 / 3, 1, 2 / 3, 1 / 3])
+    np.testing.assert_allclose(centrality(range(7, 11)), [0.5, 1, 1, 0.5])
+    np.testing.assert_allclose(centrality([3]), [1])
+
+
+def test_weights_fall_to_the_ends_of_each_run_but_not_at_a_few_missing_images() -> None:
+    two_runs = [10, 11, 12, 90, 91, 92, 93, 94]
+    np.testing.assert_allclose(centrality(two_runs), np.array([1, 2, 1, 1, 2, 3, 2, 1]) / 3)
+    np.testing.assert_allclose(centrality([0, 1, 7, 8]), [0.5, 1, 1, 0.5])
+    np.testing.assert_allclose(centrality([0, 1, 8, 9]), [1, 1, 1, 1])
 
 
 def test_drift_is_blended_steadily_from_one_piece_to_the_next() -> None:
@@ -224,7 +244,7 @@ def test_one_bad_pose_is_dropped_where_the_other_piece_holds_the_image_more_cent
 def test_two_of_three_pieces_outvote_the_most_central_one() -> None:
     exact = make_world((range(0, 8), range(2, 10), range(4, 14), range(1, 5)))
     world = moved(exact, 1, 6, (0.5, 0, 0), 10)
-    assert centrality(8)[4] > centrality(8)[1], "the bad piece holds image 6 more central than the first"
+    assert centrality(range(8))[4] > centrality(range(8))[1], "the bad piece holds image 6 more central than the first"
     cameras = world.cameras()
     np.testing.assert_allclose(invert_rigid(cameras.cam_from_world), exact.world_from_cam, atol=1e-9)
     assert cameras.num_dropped[6] == 1
@@ -240,7 +260,7 @@ def test_noise_is_averaged_down_but_not_out() -> None:
         noisy[:, :, 3] += rng.normal(scale=0.01, size=(NUM_IMAGES, 3))
         noisy[:, :, :3] @= Rotation.from_rotvec(rng.normal(scale=0.01, size=(NUM_IMAGES, 3))).as_matrix()
         pieces.append(replace(piece, seg_from_cam=world_from.inverse().move_cameras(noisy)))
-    fused = invert_rigid(fuse_cameras(pieces, exact.world_from_seg).cam_from_world)
+    fused = invert_rigid(replace(exact, pieces=pieces).cameras().cam_from_world)
     rms = np.sqrt(np.mean((fused[:, :, 3] - exact.world_from_cam[:, :, 3]) ** 2))
     assert 0.01 / 9 < rms < 0.5 * 0.01  # the mean of nine has a third
     turn = Rotation.from_matrix(np.swapaxes(fused[:, :, :3], 1, 2) @ exact.world_from_cam[:, :, :3])
@@ -253,7 +273,7 @@ def test_rotations_stay_rotations_and_two_equal_votes_meet_half_way() -> None:
     poses = exact.world_from_cam.copy()
     poses[:, :, :3] @= turn
     pieces = [exact.pieces[0], make_piece(1, range(14), exact.world_from_seg[1].inverse().move_cameras(poses))]
-    fused = invert_rigid(fuse_cameras(pieces, exact.world_from_seg).cam_from_world)
+    fused = invert_rigid(replace(exact, pieces=pieces).cameras().cam_from_world)
     half = exact.world_from_cam[:, :, :3] @ Rotation.from_euler("y", 20, degrees=True).as_matrix()
     np.testing.assert_allclose(fused[:, :, :3], half, atol=1e-12)
 
@@ -266,7 +286,7 @@ def test_three_opposite_votes_still_make_a_rotation() -> None:
         poses = exact.world_from_cam.copy()
         poses[:, :, :3] @= Rotation.from_rotvec(np.pi * np.eye(3)[axis]).as_matrix()
         pieces.append(make_piece(axis, range(14), world_from.inverse().move_cameras(poses)))
-    rotations = fuse_cameras(pieces, exact.world_from_seg).cam_from_world[:, :, :3]
+    rotations = replace(exact, pieces=pieces).cameras().cam_from_world[:, :, :3]
     np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-12)
     np.testing.assert_allclose(rotations @ np.swapaxes(rotations, 1, 2), np.tile(np.eye(3), (14, 1, 1)), atol=1e-12)
 
@@ -277,12 +297,93 @@ def test_pieces_that_disagree_everywhere_are_blended_and_the_spread_tells() -> N
     np.testing.assert_allclose(cameras.position_spread[7:10] * cameras.scene_radius, 5, rtol=1e-9)
 
 
-def test_fusing_needs_a_transform_per_piece() -> None:
+def test_fusing_needs_a_piece() -> None:
+    with pytest.raises(ValueError, match="no piece, needed at least one"):
+        fuse_cameras([])
+
+
+# ------------------------------------------------------------------------------- loops
+LOOP = (0, 1, 2, 11, 12, 13)
+
+
+def test_loop_piece_has_no_say_where_a_window_placed_the_image() -> None:
+    without = make_world()
+    world = shifted(make_world((*WINDOWS, LOOP)), 3, (0.1, 0, 0))
+    cameras = fuse_cameras(world.placed(loops=[3]))
+    np.testing.assert_array_equal(cameras.cam_from_world, without.cameras().cam_from_world)
+    np.testing.assert_array_equal(cameras.num_pieces, without.cameras().num_pieces)
+    np.testing.assert_array_equal(cameras.best_piece, without.cameras().best_piece)
+    as_window = fuse_cameras(world.placed())
+    assert np.abs(as_window.cam_from_world - cameras.cam_from_world).max() > 0.01
+
+
+def test_loop_piece_places_the_images_that_no_window_holds() -> None:
+    exact = make_world((range(1, 8), range(4, 13), LOOP))
+    world = moved(exact, 2, 13, (0.1, 0, 0))
+    cameras = fuse_cameras(world.placed(loops=[2]))
+    assert cameras.images == tuple(range(14))
+    assert cameras.best_piece[[0, 13]].tolist() == [2, 2]
+    assert 2 not in cameras.best_piece[1:13]
+    assert cameras.num_pieces[[0, 1, 13]].tolist() == [1, 1, 1]
+    wrong_by = invert_rigid(cameras.cam_from_world)[:, :, 3] - world.world_from_cam[:, :, 3]
+    np.testing.assert_allclose(wrong_by[13], [0.1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(wrong_by[:13], 0, atol=1e-12)
+
+
+def test_cloud_takes_pixels_of_a_loop_piece_only_for_its_own_images() -> None:
+    windows, loop = (range(1, 8), range(4, 13)), LOOP
+    world = make_world((*windows, loop))
+    placed = world.placed(loops=[2])
+
+    def num_pixels(world: World, placed: Sequence[PlacedPiece]) -> int:
+        cameras = fuse_cameras(placed)
+        return fuse_points(placed, world.dense, cameras, max_points=20_000, min_confidence=2.0).num_pixels
+
+    ends = sum(np.count_nonzero(world.dense[2].confidences[k] >= 2) for k in (0, 5))
+    alone = make_world(windows)
+    assert num_pixels(world, placed) == num_pixels(alone, alone.placed()) + ends
+
+
+def test_loop_piece_votes_on_the_calibration_with_its_own_images_only() -> None:
+    world = make_world((range(1, 4), range(0, 14)))
+    pieces = [with_focal(p, f) for p, f in zip(world.pieces, (500.0, 600.0), strict=True)]
+    placed = replace(world, pieces=pieces).placed(loops=[1])
+    # Of camera 0 the window has all images, of camera 1 none.
+    fused = fuse_intrinsics(placed, [0] * 4 + [1] * 10)
+    # The loop has image 0 of camera 0: one vote against three.
+    assert (fused[0].params[0], fused[1].params[0]) == (500, 600)
+
+
+# ------------------------------------------------------------------------ wider groups
+@pytest.mark.parametrize("group", [Affine3, SL4])
+def test_wider_groups_that_do_not_bend_give_the_same_scene(group: type[Transform]) -> None:
     world = make_world()
-    with pytest.raises(ValueError, match=r"3 pieces and 2 companions"):
-        fuse_cameras(world.pieces, world.world_from_seg[:2])
-    with pytest.raises(ValueError, match=r"0 pieces and 0 companions"):
-        fuse_cameras([], [])
+    wide = replace(world, world_from_seg=[group.from_matrix(one.matrix) for one in world.world_from_seg])
+    np.testing.assert_allclose(wide.cameras().cam_from_world, world.cameras().cam_from_world, atol=1e-5)
+    assert 0 <= wide.cameras().residual_px.max() < 0.01
+    radius = np.linalg.norm(wide.points().cloud.xyz, axis=1)
+    assert 1 - wide.points().voxel_size ** 2 < radius.min() < radius.max() < 1 + 1e-4
+
+
+@pytest.mark.parametrize("group", [Affine3, SL4])
+def test_bent_pieces_are_straightened_with_their_points(group: type[Affine3] | type[SL4]) -> None:
+    """A piece that was reconstructed warped, and the transform that takes the warp back."""
+    world = make_world((range(0, 14),))
+    tangent = 0.03 * np.random.default_rng(3).normal(size=group.DOF)
+    warped_from_world = group.exp(tangent)
+    maps = world.dense[0]
+    for k, pointmap in enumerate(maps.pointmaps):
+        maps.pointmaps[k] = warped_from_world.apply(pointmap.reshape(-1, 3)).reshape(pointmap.shape).astype(np.float32)
+    bent_world = replace(world, world_from_seg=[warped_from_world.inverse()])
+    # The piece's own cameras are those that see the warped points best, as a backbone's would.
+    own = place_piece(world.pieces[0], make_world((range(0, 14),)).dense[0], warped_from_world)
+    bent_world.pieces[0] = replace(world.pieces[0], seg_from_cam=own.world_from_cam)
+    cameras = bent_world.cameras()
+    assert 0.1 < cameras.residual_px.max() < 30
+    offsets = invert_rigid(cameras.cam_from_world)[:, :, 3] - world.world_from_cam[:, :, 3]
+    assert np.linalg.norm(offsets, axis=1).max() < 0.02 * 3
+    radius = np.linalg.norm(bent_world.points().cloud.xyz, axis=1)
+    assert 0.98 < np.percentile(radius, 5) < np.percentile(radius, 95) < 1.02
 
 
 # -------------------------------------------------------------------------- intrinsics
@@ -292,8 +393,9 @@ def with_focal(piece: SegmentPiece, focal: float, **changes: object) -> SegmentP
 
 
 def test_one_wild_focal_length_does_not_move_the_median() -> None:
-    pieces = [with_focal(p, f) for p, f in zip(make_world().pieces, (590.0, 610.0, 9000.0), strict=True)]
-    fused = fuse_intrinsics(pieces, [0] * NUM_IMAGES)
+    world = make_world()
+    pieces = [with_focal(p, f) for p, f in zip(world.pieces, (590.0, 610.0, 9000.0), strict=True)]
+    fused = fuse_intrinsics(replace(world, pieces=pieces).placed(), [0] * NUM_IMAGES)
     assert list(fused) == [0]
     assert fused[0].params == pytest.approx((610, 320, 240, -0.05), abs=0)
     assert (fused[0].model, fused[0].width, fused[0].height) == ("SIMPLE_RADIAL", 640, 480)
@@ -302,14 +404,14 @@ def test_one_wild_focal_length_does_not_move_the_median() -> None:
 def test_a_piece_votes_with_its_registered_images() -> None:
     world = make_world((range(0, 3), range(1, 14), range(2, 4)))
     pieces = [with_focal(p, f) for p, f in zip(world.pieces, (500.0, 600.0, 700.0), strict=True)]
-    assert fuse_intrinsics(pieces, [0] * NUM_IMAGES)[0].params[0] == 600
+    assert fuse_intrinsics(replace(world, pieces=pieces).placed(), [0] * NUM_IMAGES)[0].params[0] == 600
 
 
 def test_cameras_are_fused_apart() -> None:
     world = make_world()
     pieces = [with_focal(p, f) for p, f in zip(world.pieces, (500.0, 600.0, 700.0), strict=True)]
     camera_of_image = [2] * 3 + [7] * 7 + [4] * 4
-    fused = fuse_intrinsics(pieces, camera_of_image)
+    fused = fuse_intrinsics(replace(world, pieces=pieces).placed(), camera_of_image)
     # Camera 7 has images 3..9: in the first piece 4, in the second 7, in the third 3 times.
     assert {camera: intrinsics.params[0] for camera, intrinsics in fused.items()} == {2: 500, 4: 700, 7: 600}
 
@@ -319,15 +421,16 @@ def test_the_model_of_most_images_is_taken() -> None:
     pieces = list(world.pieces)
     pinhole = Intrinsics(model="PINHOLE", width=640, height=480, params=(1, 1, 2, 2))
     pieces[1] = replace(pieces[1], intrinsics=(pinhole,) * 7)
-    fused = fuse_intrinsics(pieces, [0] * NUM_IMAGES)[0]
+    fused = fuse_intrinsics(replace(world, pieces=pieces).placed(), [0] * NUM_IMAGES)[0]
     assert (fused.model, fused.params) == (CAMERA.model, CAMERA.params)
 
 
 def test_a_focal_prior_holds_where_every_piece_had_it() -> None:
     world = make_world()
     everywhere = [with_focal(piece, 600.0, has_prior_focal=True) for piece in world.pieces]
-    assert fuse_intrinsics(everywhere, [0] * NUM_IMAGES)[0].has_prior_focal
-    assert not fuse_intrinsics([*everywhere[:2], world.pieces[2]], [0] * NUM_IMAGES)[0].has_prior_focal
+    assert fuse_intrinsics(replace(world, pieces=everywhere).placed(), [0] * NUM_IMAGES)[0].has_prior_focal
+    mixed = replace(world, pieces=[*everywhere[:2], world.pieces[2]])
+    assert not fuse_intrinsics(mixed.placed(), [0] * NUM_IMAGES)[0].has_prior_focal
 
 
 def test_one_camera_at_two_sizes_is_refused() -> None:
@@ -335,7 +438,7 @@ def test_one_camera_at_two_sizes_is_refused() -> None:
     pieces = list(world.pieces)
     pieces[1] = replace(pieces[1], intrinsics=(CAMERA.resized(320, 240),) * 7)
     with pytest.raises(ValueError, match=r"camera 0: pieces hold it at sizes \[\(320, 240\), \(640, 480\)\]"):
-        fuse_intrinsics(pieces, [0] * NUM_IMAGES)
+        fuse_intrinsics(replace(world, pieces=pieces).placed(), [0] * NUM_IMAGES)
 
 
 # ------------------------------------------------------------------------------ points
@@ -407,9 +510,8 @@ def test_cloud_moves_with_the_fused_cameras_not_with_the_pieces() -> None:
         [turn @ world_from_cam[:, :, :3], (world_from_cam[:, :, 3] @ turn.T + shift)[:, :, None]], axis=2
     )
     fused = fuse_points(
-        world.pieces,
+        world.placed(),
         world.dense,
-        world.world_from_seg,
         replace(cameras, cam_from_world=invert_rigid(elsewhere)),
         max_points=20_000,
         min_confidence=2.0,
@@ -425,7 +527,7 @@ def test_pixels_of_a_wrong_pose_follow_the_pose_that_was_kept() -> None:
     pointmap = world.dense[0].pointmaps[1]
     world.dense[0].pointmaps[1] = pointmap + np.array([0.3, 0, 0], dtype=np.float32)
     cameras = replace(world.cameras(), cam_from_world=invert_rigid(exact.world_from_cam))
-    fused = fuse_points(world.pieces, world.dense, world.world_from_seg, cameras, max_points=20_000, min_confidence=2.0)
+    fused = fuse_points(world.placed(), world.dense, cameras, max_points=20_000, min_confidence=2.0)
     radius = np.linalg.norm(fused.cloud.xyz, axis=1)
     assert 1 - fused.voxel_size**2 < radius.min() < radius.max() < 1 + 1e-5
 
@@ -551,7 +653,7 @@ def test_no_confident_pixel_gives_an_empty_cloud() -> None:
 def test_far_from_the_origin_the_cloud_keeps_its_detail() -> None:
     world = make_world()
     away = np.array([5e6, -3e6, 100.0])
-    world_from_seg = [replace(sim3, translation=sim3.translation + away) for sim3 in world.world_from_seg]
+    world_from_seg = [shifted_by(one, away) for one in world.world_from_seg]
     fused = replace(world, world_from_seg=world_from_seg).points()
     radius = np.linalg.norm(fused.cloud.xyz - away, axis=1)
     assert 1 - fused.voxel_size**2 < radius.min() < radius.max() < 1 + 1e-5
@@ -561,8 +663,8 @@ def test_points_need_sensible_arguments() -> None:
     world = make_world()
     with pytest.raises(ValueError, match=r"max_points is 0, needed at least 1"):
         world.points(max_points=0)
-    with pytest.raises(ValueError, match=r"3 pieces and 2 companions"):
-        replace(world, dense=world.dense[:2]).points()
+    with pytest.raises(ValueError, match="3 pieces and 2 sets of maps"):
+        fuse_points(world.placed(), world.dense[:2], world.cameras(), max_points=9, min_confidence=2.0)
 
 
 # ----------------------------------------------------------------------------- normals
@@ -597,9 +699,9 @@ def test_scene_holds_the_fused_parts_under_the_names_of_the_collection() -> None
     )
     collection = ImageCollection(images=images, cameras=(CAMERA, CAMERA))
     cameras = world.cameras()
-    intrinsics = fuse_intrinsics(world.pieces, [image.camera for image in images])
+    intrinsics = fuse_intrinsics(world.placed(), [image.camera for image in images])
     points = world.points(max_points=100).cloud
-    scene = build_scene(collection, world.pieces, cameras, intrinsics, points, metric=True)
+    scene = build_scene(collection, world.placed(), cameras, intrinsics, points, metric=True)
     assert scene.image_indices == tuple(range(3, 12))
     assert scene.image_names == tuple(f"{i:02}.jpg" for i in range(3, 12))
     assert scene.camera_indices == tuple(i % 2 for i in range(3, 12))
