@@ -2,13 +2,13 @@
 
 The chain is the best spanning tree of the accepted edges: the one whose edges rest on most inliers.
 In a plain sequence that is the chain of neighbouring segments; where a segment came out in pieces,
-it is whatever holds them together. What no edge reaches stays a part of its own.
-The next module to read is ``fusion``.
+it is whatever holds them together. What no edge reaches stays a part of its own. The pose graph
+takes the chain as its start; the next module to read is ``stitching``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,57 +16,74 @@ import scipy.sparse
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from smust3r_colmap.geometry.sim3 import Sim3
+from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import SegmentAlignment
 
+LOOP_HANDICAP = 1e-6
+"""Factor on the strength of edges to loops: they belong to the tree only where nothing else connects."""
 
-@dataclass(frozen=True, kw_only=True)
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ChainedPart:
     """Pieces that hang together, in the frame of the first of them.
 
     Args:
         pieces: positions in the list of all pieces; the first is the world frame.
-        world_from_seg: one per piece, the first the identity.
+        world_from_seg: one per piece, the first the identity; all in one group.
         edges: positions of the alignments in the spanning tree.
     """
 
     pieces: tuple[int, ...]
-    world_from_seg: tuple[Sim3, ...]
+    world_from_seg: tuple[Transform, ...]
     edges: tuple[int, ...]
 
 
-def chain_pieces(num_pieces: int, alignments: Sequence[SegmentAlignment]) -> tuple[ChainedPart, ...]:
+def chain_pieces(
+    nodes: Sequence[int],
+    alignments: Sequence[SegmentAlignment],
+    *,
+    loops: Collection[int] = (),
+    group: type[Transform] = Sim3,
+) -> tuple[ChainedPart, ...]:
     """Connected parts of the pieces, each chained along its best spanning tree.
 
     Args:
-        num_pieces: nodes 0 .. num_pieces - 1; the one of lowest number is its part's world frame
-            (paper III-B: everything is expressed in the first segment's frame).
-        alignments: edges; only accepted ones are used.
+        nodes: positions of the pieces that take part; the lowest is its part's world frame (paper
+            III-B: everything is expressed in the first segment's frame).
+        alignments: edges; only accepted ones between two nodes are used.
+        loops: nodes that are loop segments; the tree runs through one only where nothing else connects.
+        group: of the transforms, which are all in it.
     """
+    place = {node: k for k, node in enumerate(sorted(nodes))}
+    strength = {}
     best: dict[tuple[int, int], int] = {}
     for position, edge in enumerate(alignments):
-        if edge.accepted:
-            pair = (min(edge.target, edge.source), max(edge.target, edge.source))
-            if pair not in best or _strength(edge) > _strength(alignments[best[pair]]):
-                best[pair] = position
-    cost = scipy.sparse.lil_matrix((num_pieces, num_pieces))
-    for pair, position in best.items():
-        cost[pair] = 1.0 / _strength(alignments[position])
+        if not edge.accepted or edge.target not in place or edge.source not in place:
+            continue
+        strength[position] = _strength(edge) * (LOOP_HANDICAP if edge.target in loops or edge.source in loops else 1.0)
+        pair = (min(edge.target, edge.source), max(edge.target, edge.source))
+        if pair not in best or strength[position] > strength[best[pair]]:
+            best[pair] = position
+    cost = scipy.sparse.lil_matrix((len(place), len(place)))
+    for (a, b), position in best.items():
+        cost[place[a], place[b]] = 1.0 / strength[position]
     tree = minimum_spanning_tree(cost.tocsr())
     count, label = connected_components(tree, directed=False)
+    in_order = sorted(nodes)
     parts = []
     for part in range(count):
         root = int(np.flatnonzero(label == part)[0])
         order, parent = breadth_first_order(tree, root, directed=False)
-        world_from = {root: Sim3.identity()}
+        world_from = {in_order[root]: group.identity()}
         used = []
-        for node in order[1:]:
-            before = int(parent[node])
-            position = best[min(before, int(node)), max(before, int(node))]
+        for number in order[1:]:
+            node, before = in_order[number], in_order[parent[number]]
+            position = best[min(before, node), max(before, node)]
             edge = alignments[position]
             before_from_node = edge.estimate.b_from_a if edge.target == before else edge.estimate.b_from_a.inverse()
-            world_from[int(node)] = world_from[before] @ before_from_node
+            world_from[node] = world_from[before] @ before_from_node
             used.append(position)
-        pieces = (root, *sorted(set(world_from) - {root}))
+        pieces = tuple(sorted(world_from))
         parts.append(
             ChainedPart(
                 pieces=pieces,

@@ -14,6 +14,9 @@ from smust3r_colmap.errors import ConfigError
 
 CameraMode = Literal["auto", "single", "per-folder", "per-image"]
 BackboneName = Literal["classical"]
+TransformGroup = Literal["sim3", "se3", "affine3", "sl4"]
+AlignmentEdges = Literal["both", "points", "poses"]
+LoopKernel = Literal["cauchy", "gnc", "none"]
 AlignmentSource = Literal["auto", "tracks", "pointmaps"]
 ConfidenceWeighting = Literal["relative", "paper", "off"]
 RobustKernel = Literal["cauchy", "tukey", "huber"]
@@ -70,6 +73,11 @@ class ClassicalConfig:
 class AlignmentConfig:
     """Putting neighbouring segments together (paper sections III-C and III-E)."""
 
+    transform_group: TransformGroup = "sim3"
+    """Group of the transforms between segments (paper section III-D): sim3; se3 where the backbone is
+    metric; affine3 and sl4 also bend the geometry, and are the less stable for it."""
+    alignment_edges: AlignmentEdges = "both"
+    """Edges between two segments: from points they share, from the poses of shared cameras, or both."""
     alignment_source: AlignmentSource = "auto"
     """Correspondences: tracks shared by two segments where the backbone has them (as exact as dense
     pixels at a twentieth of the cost), pointmaps otherwise."""
@@ -79,6 +87,33 @@ class AlignmentConfig:
     """cauchy and tukey take their scale from the residuals; huber is the paper's, with a fixed delta."""
     huber_delta: float = 0.1
     """Where the paper's Huber loss turns linear, in segment units; only for the huber kernel."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopConfig:
+    """Finding places that the camera came back to, and closing the loops (paper section III-F)."""
+
+    loops: bool = True
+    """Look for loops and close them."""
+    loop_similarity: float = 0.0
+    """Cosine similarity from which two images may show one place (the paper's sigma, 0.95 there for MUSt3R);
+    0 takes it from the collection: four robust standard deviations above images that are far apart."""
+    loop_min_candidates: int = 3
+    """Image pairs that two segments must have before a loop between them is tried (the paper's k_min)."""
+    loop_min_distance: int = 3
+    """Two segments closer than this in order are no loop; the paper asks for more than 2."""
+    loop_half_width: int = 10
+    """Images before and after each end of a loop that form the loop segment, inside their segments."""
+    loop_kernel: LoopKernel = "cauchy"
+    """What keeps a false loop from bending the graph: cauchy, gnc (graduated non-convexity: slower, rejects
+    outright), or none as in the paper."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.loop_similarity < 1:
+            raise ConfigError(f"--loop-similarity {self.loop_similarity}: a cosine from 0 (automatic) to below 1")
+        for name in ("loop_min_candidates", "loop_min_distance", "loop_half_width"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"--{name.replace('_', '-')} {getattr(self, name)}: must be at least 1")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,6 +144,7 @@ class RunConfig:
     """What reconstructs a segment; classical needs no weights."""
     classical: ClassicalConfig = field(default_factory=ClassicalConfig)
     alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
+    loop_closing: LoopConfig = field(default_factory=LoopConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     workers: int = 0

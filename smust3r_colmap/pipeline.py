@@ -2,9 +2,10 @@
 
     import        images, their order, their cameras        importers.image_folder
     segment       overlapping windows (III-B)                segmentation.windows
+    find loops    places the camera came back to (III-F)     loops
     reconstruct   every segment alone (III-A)                backbones
-    align         neighbouring segments (III-C, III-E)       alignment.edges, confidence
-    chain         one frame for what hangs together          chaining
+    align         segments that share images (III-C, III-E)  alignment.edges, confidence
+    stitch        loops proven, all frames optimised (III-F) stitching, pose_graph
     fuse          every image once, one cloud                fusion
     export        COLMAP, PLY, GLB, TUM                      exporters
 
@@ -13,13 +14,14 @@ Every section leaves a finished stage in the run directory, so that a second sta
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from smust3r_colmap import fusion
 from smust3r_colmap.alignment.edges import Edges, align_pieces, candidate_pairs, needs_maps
 from smust3r_colmap.backbones.base import Backbone, BackboneResult
 from smust3r_colmap.backbones.classical.backbone import ClassicalBackbone
-from smust3r_colmap.chaining import ChainedPart, chain_pieces
+from smust3r_colmap.chaining import ChainedPart
 from smust3r_colmap.config import RunConfig
 from smust3r_colmap.config_file import config_to_toml
 from smust3r_colmap.errors import ReconstructionError
@@ -29,21 +31,43 @@ from smust3r_colmap.exporters.colmap_sparse import MODEL_FILES, refuse_names_tex
 from smust3r_colmap.exporters.glb import write_glb
 from smust3r_colmap.exporters.ply import write_ply
 from smust3r_colmap.exporters.tum_trajectory import write_tum
-from smust3r_colmap.geometry.sim3 import Sim3
+from smust3r_colmap.geometry.groups import GROUPS
+from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.importers.image_folder import (
     ImportRecord,
     check_output_not_inside,
     collection_from_scan,
     scan_image_folder,
 )
-from smust3r_colmap.products import ImageCollection, Scene, Segment, SegmentPiece, largest_first
+from smust3r_colmap.loops.planning import LoopPlan, plan_loops
+from smust3r_colmap.products import (
+    EMPTY_CLOUD,
+    ImageCollection,
+    PointCloud,
+    Scene,
+    Segment,
+    SegmentPiece,
+    largest_first,
+)
 from smust3r_colmap.progress import Reporter
+from smust3r_colmap.resection import PlacedPiece, place_piece
 from smust3r_colmap.run_directory import RunDirectory, key_of, read_json, write_json
 from smust3r_colmap.segmentation.windows import plan_windows
 from smust3r_colmap.stage_clock import StageClock, peak_memory_bytes
+from smust3r_colmap.stitching import Stitching, stitch
 from smust3r_colmap.stored_alignment import read_edges, write_edges
 from smust3r_colmap.stored_scene import read_scenes, write_scenes
-from smust3r_colmap.summary import EdgeSummary, ImageRemark, ModelSummary, RunSummary, SegmentSummary
+from smust3r_colmap.summary import (
+    EdgeSummary,
+    GraphSummary,
+    ImageRemark,
+    LoopSummary,
+    ModelSummary,
+    RunSummary,
+    SegmentSummary,
+)
+
+NOT_LOOKED_FOR = LoopPlan(threshold=None, weak_threshold=None, neighbours=0, statistics=None)
 
 
 def reconstruct(
@@ -66,16 +90,20 @@ def reconstruct(
     with RunDirectory(output, fresh=fresh) as run:
         clock = StageClock(reporter)
         collection = _import(images, config, run, clock)
-        segments = plan_windows(
+        windows = plan_windows(
             len(collection), segment_length=config.segmentation.segment_length, overlap=config.segmentation.overlap
         )
-        result = _backbone(config).reconstruct(collection, segments, run, clock)
+        backbone = _backbone(collection, config, run, clock)
+        plan = _find_loops(backbone, windows, config, run, clock)
+        segments = (*windows, *(loop.segment for loop in plan.loops))
+        result = backbone.reconstruct(segments, with_maps=_segments_with_maps(backbone, segments, config))
         _refuse_nothing(result, collection)
-        edges = _align(result, config, run, clock)
-        parts = chain_pieces(len(result.pieces), edges.alignments)
-        scenes = _fuse(result, parts, collection, config, run, clock)
-        _export(scenes, config, run, clock)
-        summary = _summarise(collection, segments, result, edges, scenes, run, clock)
+        edges = _align(result, segments, config, run, clock)
+        stitching = _stitch(result, edges, plan, config, run, clock)
+        scenes = _fuse(result, segments, stitching.parts, collection, config, run, clock)
+        unclosed = _without_loops(result, segments, stitching, collection)
+        _export(scenes, unclosed, config, run, clock)
+        summary = _summarise(collection, segments, plan, result, edges, stitching, scenes, run, clock)
         write_json(run.root / "summary.json", summary.to_json_dict())
     return summary
 
@@ -100,8 +128,43 @@ def _import(images: Path, config: RunConfig, run: RunDirectory, clock: StageCloc
     return collection
 
 
-def _backbone(config: RunConfig) -> Backbone:
-    return ClassicalBackbone(config.classical, workers=config.workers or usable_cores(), seed=config.seed)
+def _backbone(collection: ImageCollection, config: RunConfig, run: RunDirectory, clock: StageClock) -> Backbone:
+    workers = config.workers or usable_cores()
+    return ClassicalBackbone(collection, config.classical, run, clock, workers=workers, seed=config.seed)
+
+
+def _find_loops(
+    backbone: Backbone, windows: tuple[Segment, ...], config: RunConfig, run: RunDirectory, clock: StageClock
+) -> LoopPlan:
+    """Images that look alike though far apart in the sequence, and a segment for each such place."""
+    settings = config.loop_closing
+    if not settings.loops:
+        return NOT_LOOKED_FOR
+    descriptors = backbone.describe()
+    stored = run.stage("loops", key=key_of("loops", descriptors, windows, settings))
+    with clock.stage("loops", total=1) as stage:
+        if stored.is_done:
+            stage.skip(1)
+        else:
+            plan = plan_loops(
+                descriptors,
+                windows,
+                similarity=settings.loop_similarity,
+                min_candidates=settings.loop_min_candidates,
+                min_distance=settings.loop_min_distance,
+                half_width=settings.loop_half_width,
+            )
+            with stored.write() as folder:
+                write_json(folder / "plan.json", plan.to_json())
+            stage.advance()
+    return LoopPlan.from_json(read_json(stored.path / "plan.json"))
+
+
+def _segments_with_maps(backbone: Backbone, segments: tuple[Segment, ...], config: RunConfig) -> frozenset[int]:
+    """Windows make the cloud; loops only tie the graph, and need maps where the edges are made of them."""
+    source = config.alignment.alignment_source
+    edges_from_maps = source == "pointmaps" or (source == "auto" and not backbone.has_tracks)
+    return frozenset(segment.index for segment in segments if segment.kind == "window" or edges_from_maps)
 
 
 def _refuse_nothing(result: BackboneResult, collection: ImageCollection) -> None:
@@ -115,26 +178,65 @@ def _refuse_nothing(result: BackboneResult, collection: ImageCollection) -> None
     )
 
 
-def _align(result: BackboneResult, config: RunConfig, run: RunDirectory, clock: StageClock) -> Edges:
-    """Sim(3) between all pieces that have something in common (paper eqs. 1 and 2)."""
+def _align(
+    result: BackboneResult, segments: tuple[Segment, ...], config: RunConfig, run: RunDirectory, clock: StageClock
+) -> Edges:
+    """Transforms between all pieces that have something in common (paper eqs. 1 to 3)."""
+    loops = frozenset(segment.index for segment in segments if segment.kind == "loop")
+    num_pairs = len(candidate_pairs(result.pieces, loops))
     geometry = [(piece.name, piece.images, piece.seg_from_cam, piece.tracks) for piece in result.pieces]
     maps = result.dense_key if needs_maps(result.pieces, config.alignment) else None
-    inputs = (geometry, maps, result.links)
+    inputs = (geometry, maps, result.links, sorted(loops))
     stored = run.stage("alignment", key=key_of("alignment", inputs, config.alignment, config.seed))
-    with clock.stage("alignment", total=len(candidate_pairs(result.pieces))) as stage:
+    with clock.stage("alignment", total=num_pairs) as stage:
         if stored.is_done:
-            stage.skip(len(candidate_pairs(result.pieces)))
+            stage.skip(num_pairs)
         else:
             edges = align_pieces(
-                result.pieces, result.dense, result.links, config.alignment, seed=config.seed, advance=stage.advance
+                result.pieces,
+                result.dense,
+                result.links,
+                config.alignment,
+                loop_segments=loops,
+                seed=config.seed,
+                advance=stage.advance,
             )
             with stored.write() as folder:
                 write_edges(folder, edges)
-    return read_edges(stored.path)
+    return _with_warnings(read_edges(stored.path), config, clock)
+
+
+def _with_warnings(edges: Edges, config: RunConfig, clock: StageClock) -> Edges:
+    fallen_back = [edge for edge in edges.alignments if edge.fallback]
+    if fallen_back:
+        clock.warn(
+            f"{len(fallen_back)} of {len(edges.alignments)} edges are similarities instead of "
+            f"{config.alignment.transform_group}, such as: {fallen_back[0].fallback}"
+        )
+    return edges
+
+
+def _stitch(
+    result: BackboneResult, edges: Edges, plan: LoopPlan, config: RunConfig, run: RunDirectory, clock: StageClock
+) -> Stitching:
+    """Loops proven or refused, one frame for whatever hangs together."""
+    with clock.stage("pose graph", total=1) as stage:
+        stitching = stitch(
+            result.pieces,
+            edges.alignments,
+            plan.loops,
+            group=GROUPS[config.alignment.transform_group],
+            kernel=config.loop_closing.loop_kernel,
+        )
+        stage.advance()
+    if not stitching.solution.improved and len(edges.alignments):
+        clock.note(f"pose graph: {stitching.solution.stop_reason}")
+    return stitching
 
 
 def _fuse(
     result: BackboneResult,
+    segments: tuple[Segment, ...],
     parts: tuple[ChainedPart, ...],
     collection: ImageCollection,
     config: RunConfig,
@@ -145,27 +247,24 @@ def _fuse(
     inputs = [
         [_scene_input(result.pieces[p], world_from, collection) for p, world_from in _members(part)] for part in parts
     ]
-    stored = run.stage("scene", key=key_of("scene", inputs, result.dense_key, config.fusion))
-    camera_of_image = [image.camera for image in collection.images]
+    kinds = [segment.kind for segment in segments]
+    stored = run.stage("scene", key=key_of("scene", inputs, kinds, result.dense_key, config.fusion))
     with clock.stage("fusion", total=len(parts)) as stage:
         if stored.is_done:
             stage.skip(len(parts))
             return read_scenes(stored.path)
         scenes = []
         for part in parts:
-            pieces = [result.pieces[p] for p in part.pieces]
-            cameras = fusion.fuse_cameras(pieces, part.world_from_seg)
+            placed = _placed_pieces(part, result, segments)
+            cameras = fusion.fuse_cameras(placed)
             cloud = fusion.fuse_points(
-                pieces,
+                placed,
                 [result.dense[p] for p in part.pieces],
-                part.world_from_seg,
                 cameras,
                 max_points=config.fusion.max_points,
                 min_confidence=config.fusion.min_confidence,
             ).cloud
-            intrinsics = fusion.fuse_intrinsics(pieces, camera_of_image)
-            metric = all(result.reconstructions[piece.segment].metric for piece in pieces)
-            scenes.append(fusion.build_scene(collection, pieces, cameras, intrinsics, cloud, metric=metric))
+            scenes.append(_scene(placed, cameras, cloud, result, collection))
             stage.advance()
         kept = _without_repeats(largest_first(scenes))
         with stored.write() as folder:
@@ -173,15 +272,40 @@ def _fuse(
     return kept
 
 
-def _members(part: ChainedPart) -> list[tuple[int, Sim3]]:
+def _placed_pieces(part: ChainedPart, result: BackboneResult, segments: tuple[Segment, ...]) -> tuple[PlacedPiece, ...]:
+    return tuple(
+        place_piece(
+            result.pieces[p],
+            result.dense[p],
+            world_from_seg,
+            is_loop=segments[result.pieces[p].segment].kind == "loop",
+        )
+        for p, world_from_seg in _members(part)
+    )
+
+
+def _scene(
+    placed: tuple[PlacedPiece, ...],
+    cameras: fusion.FusedCameras,
+    cloud: PointCloud,
+    result: BackboneResult,
+    collection: ImageCollection,
+) -> Scene:
+    intrinsics = fusion.fuse_intrinsics(placed, [image.camera for image in collection.images])
+    metric = all(result.reconstructions[one.piece.segment].metric for one in placed)
+    return fusion.build_scene(collection, placed, cameras, intrinsics, cloud, metric=metric)
+
+
+def _members(part: ChainedPart) -> list[tuple[int, Transform]]:
     return list(zip(part.pieces, part.world_from_seg, strict=True))
 
 
-def _scene_input(piece: SegmentPiece, world_from_seg: Sim3, collection: ImageCollection) -> tuple[object, ...]:
+def _scene_input(piece: SegmentPiece, world_from_seg: Transform, collection: ImageCollection) -> tuple[object, ...]:
     """What a piece puts into a scene besides its maps; the names too, for files may be renamed."""
     images = [collection.images[index] for index in piece.images]
     names = [(image.name, image.camera) for image in images]
-    return piece.name, world_from_seg.matrix, piece.images, names, piece.seg_from_cam, piece.intrinsics
+    geometry = (piece.seg_from_cam, piece.intrinsics, piece.tracks)
+    return piece.name, type(world_from_seg).__name__, world_from_seg.matrix, piece.images, names, geometry
 
 
 def _without_repeats(scenes: tuple[Scene, ...]) -> tuple[Scene, ...]:
@@ -195,8 +319,25 @@ def _without_repeats(scenes: tuple[Scene, ...]) -> tuple[Scene, ...]:
     return tuple(kept)
 
 
-def _export(scenes: tuple[Scene, ...], config: RunConfig, run: RunDirectory, clock: StageClock) -> None:
-    """Every model for COLMAP; cloud, viewer file and trajectory of the largest."""
+def _without_loops(
+    result: BackboneResult, segments: tuple[Segment, ...], stitching: Stitching, collection: ImageCollection
+) -> Scene | None:
+    """The cameras of the largest part as the chain alone puts them, to compare with; None where no loop was closed."""
+    if not any(verdict.accepted for verdict in stitching.verdicts):
+        return None
+    part = max(stitching.chained, key=lambda part: len({i for p in part.pieces for i in result.pieces[p].images}))
+    placed = _placed_pieces(part, result, segments)
+    return _scene(placed, fusion.fuse_cameras(placed), EMPTY_CLOUD, result, collection)
+
+
+def _export(
+    scenes: tuple[Scene, ...],
+    unclosed: Scene | None,
+    config: RunConfig,
+    run: RunDirectory,
+    clock: StageClock,
+) -> None:
+    """Every model for COLMAP; cloud, viewer file and trajectory of the largest, and how it was without loops."""
     with clock.stage("export", total=len(scenes)) as stage:
         run.clear_results(MODEL_FILES)
         for number, scene in enumerate(scenes):
@@ -205,14 +346,18 @@ def _export(scenes: tuple[Scene, ...], config: RunConfig, run: RunDirectory, clo
         write_ply(scenes[0].points, run.root / "points.ply")
         write_glb(scenes[0], run.root / "scene.glb")
         write_tum(scenes[0], run.root / "trajectory_tum.txt", None)
+        if unclosed is not None:
+            write_tum(unclosed, run.root / "trajectory_without_loops_tum.txt", None)
         replace_file(run.root / "config.toml", config_to_toml(config).encode())
 
 
 def _summarise(
     collection: ImageCollection,
     segments: tuple[Segment, ...],
+    plan: LoopPlan,
     result: BackboneResult,
     edges: Edges,
+    stitching: Stitching,
     scenes: tuple[Scene, ...],
     run: RunDirectory,
     clock: StageClock,
@@ -220,7 +365,6 @@ def _summarise(
     placed = {image for scene in scenes for image in scene.image_indices}
     why = {left.image: left.reason for one in result.reconstructions for left in one.unregistered}
     no_features = {one.name: one.reason for one in result.rejected}
-    names = [piece.name for piece in result.pieces]
     return RunSummary(
         output=run.root,
         num_images=len(collection),
@@ -248,6 +392,7 @@ def _summarise(
         segments=tuple(
             SegmentSummary(
                 index=segment.index,
+                kind=segment.kind,
                 num_images=len(segment.images),
                 num_pieces=len(one.pieces),
                 num_registered=len({image for piece in one.pieces for image in piece.images}),
@@ -255,25 +400,66 @@ def _summarise(
             )
             for segment, one in zip(segments, result.reconstructions, strict=True)
         ),
-        edges=tuple(
-            EdgeSummary(
-                target=names[edge.target],
-                source=names[edge.source],
-                relative_residual=edge.relative_residual,
-                accepted=edge.accepted,
-                reason=edge.reason,
-            )
-            for edge in edges.alignments
-        )
-        + tuple(
-            EdgeSummary(
-                target=names[failure.target],
-                source=names[failure.source],
-                relative_residual=float("nan"),
-                accepted=False,
-                reason=failure.reason,
-            )
-            for failure in edges.failures
+        edges=_edge_summaries(edges, [piece.name for piece in result.pieces]),
+        loops=_loop_summaries(plan, stitching, collection),
+        loops_note=plan.note,
+        graph=GraphSummary(
+            num_nodes=sum(len(part.pieces) for part in stitching.parts),
+            num_edges=stitching.num_edges,
+            num_loops=sum(verdict.accepted for verdict in stitching.verdicts),
+            cost_before=stitching.solution.cost_before,
+            cost_after=stitching.solution.cost_after,
+            iterations=stitching.solution.iterations,
+            stop_reason=stitching.solution.stop_reason,
+            improved=stitching.solution.improved,
         ),
         peak_memory_bytes=peak_memory_bytes(),
+    )
+
+
+def _edge_summaries(edges: Edges, names: list[str]) -> tuple[EdgeSummary, ...]:
+    found = tuple(
+        EdgeSummary(
+            target=names[edge.target],
+            source=names[edge.source],
+            evidence=edge.evidence,
+            relative_residual=edge.relative_residual,
+            accepted=edge.accepted,
+            reason=edge.reason,
+            fallback=edge.fallback,
+        )
+        for edge in edges.alignments
+    )
+    not_found = tuple(
+        EdgeSummary(
+            target=names[failure.target],
+            source=names[failure.source],
+            evidence=failure.evidence,
+            relative_residual=math.nan,
+            accepted=False,
+            reason=failure.reason,
+        )
+        for failure in edges.failures
+    )
+    return found + not_found
+
+
+def _loop_summaries(plan: LoopPlan, stitching: Stitching, collection: ImageCollection) -> tuple[LoopSummary, ...]:
+    return tuple(
+        LoopSummary(
+            image_a=collection.images[loop.image_a].name,
+            image_b=collection.images[loop.image_b].name,
+            similarity=loop.similarity,
+            segment_a=loop.segment_a,
+            segment_b=loop.segment_b,
+            segment=loop.segment.index,
+            accepted=verdict.accepted,
+            reason=verdict.reason,
+            closure_sigmas=verdict.closure_sigmas,
+            gap_before_percent=100 * before.distance,
+            gap_after_percent=100 * after.distance,
+            turn_before_deg=before.turn_deg,
+            turn_after_deg=after.turn_deg,
+        )
+        for loop, verdict, (before, after) in zip(plan.loops, stitching.verdicts, stitching.gaps, strict=True)
     )

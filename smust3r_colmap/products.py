@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from smust3r_colmap.geometry.camera import Intrinsics
-from smust3r_colmap.geometry.sim3 import Sim3
+from smust3r_colmap.geometry.transform import Transform
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -82,6 +82,9 @@ class ImageCollection:
 
 
 # ----------------------------------------------------------------------- segmentation
+SegmentKind = Literal["window", "loop"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Segment:
     """Images that are reconstructed together.
@@ -89,16 +92,22 @@ class Segment:
     Args:
         index: number of the segment in the plan.
         images: indices into the collection, in order, without repeats.
-        kind: ``"window"`` of the sequence; other kinds come with other planners.
+        kind: ``"window"`` of the sequence, or ``"loop"``: images around the two ends of a loop.
     """
 
     index: int
     images: tuple[int, ...]
-    kind: str = "window"
+    kind: SegmentKind = "window"
 
     def __post_init__(self) -> None:
         if len(set(self.images)) != len(self.images) or not self.images:
             raise ValueError(f"segment {self.index}: images must be distinct and at least one")
+
+
+def consecutive_runs(images: Sequence[int]) -> tuple[tuple[int, ...], ...]:
+    """Ascending image indices cut wherever one is missing: the two sides of a loop segment."""
+    cuts = np.flatnonzero(np.diff(images) != 1) + 1
+    return tuple(tuple(int(image) for image in run) for run in np.split(np.asarray(images, dtype=np.int64), cuts))
 
 
 # --------------------------------------------------------------------- reconstruction
@@ -185,7 +194,6 @@ class SegmentPiece:
         method: which rung of the ladder made it, in words.
         reprojection_error_px: mean over the observations; NaN where the backbone has no features.
         tracks: feature tracks, where the backbone has them.
-        descriptors: (N, D) float32, unit length; one per image, for finding loops.
     """
 
     segment: int
@@ -196,12 +204,9 @@ class SegmentPiece:
     method: str
     reprojection_error_px: float
     tracks: Tracks | None
-    descriptors: npt.NDArray[np.float32]
 
     def __post_init__(self) -> None:
         n = len(self.images)
-        if self.descriptors.ndim != 2 or len(self.descriptors) != n:
-            raise ValueError(f"piece {self.name}: {n} images, descriptors {self.descriptors.shape}")
         if self.seg_from_cam.shape != (n, 3, 4) or len(self.intrinsics) != n:
             raise ValueError(
                 f"piece {self.name}: {n} images, poses {self.seg_from_cam.shape}, {len(self.intrinsics)} intrinsics"
@@ -249,22 +254,22 @@ class SegmentReconstruction:
 
 # -------------------------------------------------------------------------- alignment
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sim3Estimate:
+class TransformEstimate:
     """A fitted ``b_from_a`` with its evidence.
 
     Args:
-        b_from_a: the transform.
+        b_from_a: the transform, in the group that was asked for or a smaller one.
         num_points: correspondences of positive weight that were offered.
         num_inliers: those within three robust standard deviations.
         rms: of the inlier residuals, in units of b (or relative, where the caller normalised).
         residual_sigma: robust standard deviation, 1.4826 times the median of the residuals within three of it.
         iterations: of the reweighting.
         stop_reason: ``"converged"`` or ``"iteration limit"``.
-        information: (7, 7) inverse covariance of the right perturbation
-            ``b_from_a @ exp(delta)``, delta = (translation, rotation vector, log scale).
+        information: (d, d) inverse covariance of the right perturbation ``b_from_a @ exp(delta)``,
+            delta in the order of the group's tangent, rows of the residual taken as independent.
     """
 
-    b_from_a: Sim3
+    b_from_a: Transform
     num_points: int
     num_inliers: int
     rms: float
@@ -281,19 +286,25 @@ class SegmentAlignment:
     Args:
         target, source: positions in the list of all pieces of the run.
         estimate: ``target_from_source`` with its evidence.
-        evidence: ``"tracks"``, ``"pointmaps"``, or ``"links"`` (matches between images).
+        evidence: ``"tracks"``, ``"pointmaps"``, ``"poses"`` of the shared images' cameras, or ``"links"``
+            (matches between images).
         relative_residual: median residual divided by depth, the test of a sound edge.
+        information: (d, d) inverse covariance of the right perturbation, correlated errors and the bending
+            of segments included; what a pose graph may use, where the estimate's own is too sure.
         accepted: False when the edge failed a test; it is kept for the record.
         reason: why it was refused, or empty.
+        fallback: why a smaller group than asked for was taken, or empty.
     """
 
     target: int
     source: int
-    estimate: Sim3Estimate
+    estimate: TransformEstimate
     evidence: str
     relative_residual: float
+    information: FloatArray
     accepted: bool
     reason: str = ""
+    fallback: str = ""
 
 
 # ------------------------------------------------------------------------------ scene
@@ -358,6 +369,9 @@ class Scene:
 
     def __len__(self) -> int:
         return len(self.image_indices)
+
+
+EMPTY_CLOUD = PointCloud(xyz=np.empty((0, 3)), rgb=np.empty((0, 3), np.uint8))
 
 
 def largest_first(scenes: Sequence[Scene]) -> tuple[Scene, ...]:

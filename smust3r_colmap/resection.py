@@ -152,8 +152,8 @@ def _seen_points(piece: SegmentPiece, maps: DenseMaps, world_from_seg: Transform
     cam_from_seg = invert_rigid(piece.seg_from_cam)
     for k in range(n):
         points_seg = _points_of_image(piece, maps, k)
-        points_cam = points_seg @ cam_from_seg[k, :, :3].T + cam_from_seg[k, :, 3]
         with np.errstate(invalid="ignore", divide="ignore"):
+            points_cam = points_seg @ cam_from_seg[k, :, :3].T + cam_from_seg[k, :, 3]
             moved = world_from_seg.apply(points_seg)
             usable = np.isfinite(moved).all(axis=1) & (points_cam[:, 2] > 0)
         rows = np.flatnonzero(usable)

@@ -2,7 +2,7 @@
 
     OUT/
       sparse/0/ 1/ ...     COLMAP models, largest first
-      points.ply  scene.glb  trajectory_tum.txt
+      points.ply  scene.glb  trajectory_tum.txt  trajectory_without_loops_tum.txt
       summary.json  config.toml
       work/
         lock               held by the process that writes
@@ -10,6 +10,7 @@
         import/            what was read of each file
         features/          database.db: keypoints, descriptors, matches, ids = index + 1
         descriptors/       one vector per image
+        loops/             every candidate for a loop and what became of it, the loop segments
         segments/0000/     mapping/  calibrated/  depth_0/  depth_1/ ...
         alignment/         edges between the pieces
         scene/             the fused models, before they are exported
@@ -59,7 +60,14 @@ class RunDirectory:
         StorageError: the disk refused.
     """
 
-    RESULTS = ("points.ply", "scene.glb", "trajectory_tum.txt", "summary.json", "config.toml")
+    RESULTS = (
+        "points.ply",
+        "scene.glb",
+        "trajectory_tum.txt",
+        "trajectory_without_loops_tum.txt",
+        "summary.json",
+        "config.toml",
+    )
 
     def __init__(self, root: Path, *, fresh: bool = False) -> None:
         self.root = root

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from smust3r_colmap.alignment.edges import Edges, TriedAlignment
-from smust3r_colmap.geometry.sim3 import Sim3
-from smust3r_colmap.products import SegmentAlignment, Sim3Estimate
+from smust3r_colmap.geometry.groups import GROUPS
+from smust3r_colmap.products import SegmentAlignment, TransformEstimate
 from smust3r_colmap.run_directory import read_json, write_json
 
 _FILE = "edges.json"
+_NAMES = {group: name for name, group in GROUPS.items()}
 
 
 def write_edges(folder: Path, edges: Edges) -> None:
@@ -40,40 +41,34 @@ def _plain(edge: SegmentAlignment) -> dict[str, Any]:
     return {
         "target": edge.target,
         "source": edge.source,
-        "target_from_source": {
-            "scale": float(estimate.b_from_a.scale),
-            "rotation": estimate.b_from_a.rotation.tolist(),
-            "translation": estimate.b_from_a.translation.tolist(),
-        },
+        "group": _NAMES[type(estimate.b_from_a)],
+        "target_from_source": estimate.b_from_a.matrix.tolist(),
         "num_points": estimate.num_points,
         "num_inliers": estimate.num_inliers,
         "rms": _number(estimate.rms),
         "residual_sigma": _number(estimate.residual_sigma),
         "iterations": estimate.iterations,
         "stop_reason": estimate.stop_reason,
-        "information": estimate.information.tolist(),
+        "estimate_information": estimate.information.tolist(),
         "evidence": edge.evidence,
         "relative_residual": _number(edge.relative_residual),
+        "information": edge.information.tolist(),
         "accepted": edge.accepted,
         "reason": edge.reason,
+        "fallback": edge.fallback,
     }
 
 
 def _edge(facts: dict[str, Any]) -> SegmentAlignment:
-    transform = facts["target_from_source"]
-    estimate = Sim3Estimate(
-        b_from_a=Sim3(
-            scale=np.asarray(transform["scale"]),
-            rotation=np.asarray(transform["rotation"]),
-            translation=np.asarray(transform["translation"]),
-        ),
+    estimate = TransformEstimate(
+        b_from_a=GROUPS[facts["group"]].from_matrix(facts["target_from_source"]),
         num_points=facts["num_points"],
         num_inliers=facts["num_inliers"],
         rms=_or_nan(facts["rms"]),
         residual_sigma=_or_nan(facts["residual_sigma"]),
         iterations=facts["iterations"],
         stop_reason=facts["stop_reason"],
-        information=np.asarray(facts["information"]),
+        information=np.asarray(facts["estimate_information"]),
     )
     return SegmentAlignment(
         target=facts["target"],
@@ -81,8 +76,10 @@ def _edge(facts: dict[str, Any]) -> SegmentAlignment:
         estimate=estimate,
         evidence=facts["evidence"],
         relative_residual=_or_nan(facts["relative_residual"]),
+        information=np.asarray(facts["information"]),
         accepted=facts["accepted"],
         reason=facts["reason"],
+        fallback=facts["fallback"],
     )
 
 

@@ -68,3 +68,37 @@ class StoredMaps:
         height, width = depth.shape
         intrinsics = self._piece.intrinsics[k].resized(width, height)
         return pointmap_from_depth(depth, intrinsics, self._piece.seg_from_cam[k])
+
+
+class EmptyMaps:
+    """``DenseMaps`` without a single pixel of depth, for a piece whose maps nobody needs or that got none.
+
+    Args:
+        piece: gives the number and the shape of the images.
+        longer_side: of each map, in pixels; smaller images keep their size.
+    """
+
+    def __init__(self, piece: SegmentPiece, *, longer_side: int) -> None:
+        self._shapes = []
+        for intrinsics in piece.intrinsics:
+            shrink = min(1.0, longer_side / max(intrinsics.width, intrinsics.height))
+            self._shapes.append((max(1, round(intrinsics.height * shrink)), max(1, round(intrinsics.width * shrink))))
+
+    def __len__(self) -> int:
+        return len(self._shapes)
+
+    def depth(self, k: int) -> npt.NDArray[np.float32]:
+        """(H, W) zeros."""
+        return np.zeros(self._shapes[k], np.float32)
+
+    def confidence(self, k: int) -> npt.NDArray[np.float32]:
+        """(H, W) ones."""
+        return np.ones(self._shapes[k], np.float32)
+
+    def rgb(self, k: int) -> npt.NDArray[np.uint8]:
+        """(H, W, 3) black."""
+        return np.zeros((*self._shapes[k], 3), np.uint8)
+
+    def pointmap_seg(self, k: int) -> npt.NDArray[np.float32]:
+        """(H, W, 3) NaN."""
+        return np.full((*self._shapes[k], 3), np.nan, np.float32)

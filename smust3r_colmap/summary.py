@@ -70,6 +70,7 @@ class SegmentSummary:
 
     Args:
         index: of the segment in the plan.
+        kind: ``"window"`` or ``"loop"``.
         num_images: images it was given.
         num_pieces: connected pieces that came out; 0 when nothing did.
         num_registered: images with a pose, over all its pieces.
@@ -77,6 +78,7 @@ class SegmentSummary:
     """
 
     index: int
+    kind: str
     num_images: int
     num_pieces: int
     num_registered: int
@@ -89,16 +91,74 @@ class EdgeSummary:
 
     Args:
         target, source: names of the pieces.
+        evidence: what it rests on: tracks, pointmaps, poses or links.
         relative_residual: median residual divided by depth; NaN when no transform was found.
         accepted: it took part in the stitching.
         reason: why it was refused, or empty.
+        fallback: why a smaller group than asked for was taken, or empty.
     """
 
     target: str
     source: str
+    evidence: str
     relative_residual: float
     accepted: bool
     reason: str = ""
+    fallback: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopSummary:
+    """A place that the camera may have come back to, and what became of it.
+
+    Args:
+        image_a, image_b: names of the two images that look most alike.
+        similarity: cosine of their descriptors.
+        segment_a, segment_b: windows that hold them. segment: the loop segment.
+        accepted: it closes the loop in the result.
+        reason: why not, or empty.
+        closure_sigmas: how far the loop is from the chain of windows, in standard deviations per degree
+            of freedom; NaN where nothing else connects the two.
+        gap_before_percent, gap_after_percent: distance between where the two windows put the cameras of
+            the second end, joined through the loop, in percent of the extent of all cameras, without
+            and with loop closing; NaN where it cannot be told.
+        turn_before_deg, turn_after_deg: the same for their orientations.
+    """
+
+    image_a: str
+    image_b: str
+    similarity: float
+    segment_a: int
+    segment_b: int
+    segment: int
+    accepted: bool
+    reason: str
+    closure_sigmas: float
+    gap_before_percent: float
+    gap_after_percent: float
+    turn_before_deg: float
+    turn_after_deg: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraphSummary:
+    """The optimisation of all frames.
+
+    Args:
+        num_nodes, num_edges, num_loops: of the graph.
+        cost_before, cost_after: of the same objective; without loops and with one edge per pair, zero.
+        iterations, stop_reason: of the optimiser.
+        improved: its result was used; otherwise the chain was kept.
+    """
+
+    num_nodes: int
+    num_edges: int
+    num_loops: int
+    cost_before: float
+    cost_after: float
+    iterations: int
+    stop_reason: str
+    improved: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,6 +175,8 @@ class RunSummary:
         stages: in the order in which they ran.
         segments: in the order of the plan.
         edges: alignments that were tried.
+        loops: that were planned. loops_note: why none could be looked for, or empty.
+        graph: the optimisation of the frames of all pieces.
         peak_memory_bytes: largest resident size of this process or of one of its children.
 
     Raises:
@@ -130,6 +192,9 @@ class RunSummary:
     stages: tuple[StageSummary, ...]
     segments: tuple[SegmentSummary, ...]
     edges: tuple[EdgeSummary, ...]
+    loops: tuple[LoopSummary, ...]
+    loops_note: str
+    graph: GraphSummary
     peak_memory_bytes: int
 
     def __post_init__(self) -> None:
@@ -165,7 +230,7 @@ class RunSummary:
                 f"the images fall into {len(self.models)} models that could not be connected; "
                 f"the largest has {self.models[0].num_images} of {self.num_images} images"
             )
-        empty = [str(segment.index) for segment in self.segments if not segment.num_pieces]
+        empty = [str(segment.index) for segment in self.segments if segment.kind == "window" and not segment.num_pieces]
         if empty:
             reasons.append(f"nothing came out of segment {', '.join(empty)}")
         return tuple(reasons)
@@ -192,6 +257,7 @@ class RunSummary:
         """Several lines for people, ending without a line break."""
         lines = [f"{self.num_registered} of {self.num_images} images have a pose. Scale: {self.scale_statement}."]
         lines += [f"  {_model_line(model)}" for model in self.models]
+        lines += _loop_lines(self.loops, self.loops_note)
         lines += _remark_lines("without a pose", self.unregistered)
         lines += _remark_lines("left out", self.rejected)
         lines += [f"weak: {reason}" for reason in self.weak_reasons]
@@ -211,6 +277,21 @@ class RunSummary:
 def _model_line(model: ModelSummary) -> str:
     segments = f"segments {', '.join(model.segments)}" if len(model.segments) > 1 else "one segment"
     return f"{model.folder}: {model.num_images} images, {model.num_points} points, {segments}"
+
+
+def _loop_lines(loops: tuple[LoopSummary, ...], note: str) -> list[str]:
+    if not loops:
+        return [f"  no loops: {note}"] if note else []
+    closed = [loop for loop in loops if loop.accepted]
+    lines = [f"  {len(closed)} of {len(loops)} loops closed"]
+    for loop in closed[:_NAMES_SHOWN]:
+        line = f"  loop: {loop.image_a} and {loop.image_b}"
+        if math.isfinite(loop.gap_before_percent):
+            line += f", gap {loop.gap_before_percent:.2f} % of the extent before, {loop.gap_after_percent:.2f} % after"
+        else:
+            line += ", between parts that no overlap connects"
+        lines.append(line)
+    return lines
 
 
 def _remark_lines(what: str, remarks: tuple[ImageRemark, ...]) -> list[str]:

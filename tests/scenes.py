@@ -60,7 +60,6 @@ def make_piece(
         method="synthetic",
         reprojection_error_px=0.3,
         tracks=tracks if with_tracks else None,
-        descriptors=np.zeros((len(images), 2), np.float32),
     )
 
 

@@ -30,6 +30,7 @@ from smust3r_colmap.progress import (
 )
 from smust3r_colmap.summary import (
     EdgeSummary,
+    GraphSummary,
     ImageRemark,
     ModelSummary,
     RunSummary,
@@ -48,8 +49,20 @@ GOOD = RunSummary(
         StageSummary(name="features", wall_s=1.0, cpu_s=1.5, reused=False),
         StageSummary(name="alignment", wall_s=0.2, cpu_s=0.1, reused=True),
     ),
-    segments=(SegmentSummary(index=0, num_images=4, num_pieces=1, num_registered=4, method="mapping"),),
-    edges=(EdgeSummary(target="0", source="1", relative_residual=0.01, accepted=True),),
+    segments=(SegmentSummary(index=0, kind="window", num_images=4, num_pieces=1, num_registered=4, method="mapping"),),
+    edges=(EdgeSummary(target="0", source="1", evidence="tracks", relative_residual=0.01, accepted=True),),
+    loops=(),
+    loops_note="",
+    graph=GraphSummary(
+        num_nodes=2,
+        num_edges=1,
+        num_loops=0,
+        cost_before=0.0,
+        cost_after=0.0,
+        iterations=0,
+        stop_reason="nothing to do",
+        improved=False,
+    ),
     peak_memory_bytes=3 * 2**29,
 )
 
@@ -500,7 +513,9 @@ def test_long_lists_are_cut_in_the_text_but_whole_in_the_json() -> None:
 
 
 def test_summary_is_plain_json_that_does_not_name_its_folder() -> None:
-    edge = EdgeSummary(target="0", source="1", relative_residual=float("nan"), accepted=False, reason="too few")
+    edge = EdgeSummary(
+        target="0", source="1", evidence="poses", relative_residual=float("nan"), accepted=False, reason="too few"
+    )
     facts = replace(GOOD, edges=(edge,)).to_json_dict()
 
     assert json.loads(json.dumps(facts, allow_nan=False)) == facts

@@ -1,9 +1,13 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scenes import make_piece, points_ahead, rotation_about_y, some_sim3, walk
 
-from smust3r_colmap.alignment.edges import align_pieces, candidate_pairs
-from smust3r_colmap.config import AlignmentConfig
+from smust3r_colmap.alignment.edges import Edges, align_pieces, candidate_pairs
+from smust3r_colmap.alignment.from_tracks import point_depths
+from smust3r_colmap.config import AlignmentConfig, AlignmentEdges, TransformGroup
+from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.products import FeatureLinks, SegmentPiece
 from smust3r_colmap.stored_alignment import read_edges, write_edges
@@ -30,8 +34,11 @@ def two_pieces(
     return a, b, a_from_world @ b_from_world.inverse()
 
 
-def align(a: SegmentPiece, b: SegmentPiece, links: FeatureLinks | None = None):  # type: ignore[no-untyped-def]
-    return align_pieces([a, b], [], links, AlignmentConfig(), seed=0, advance=Counter())
+def align(
+    a: SegmentPiece, b: SegmentPiece, links: FeatureLinks | None = None, *, edges: AlignmentEdges = "points"
+) -> Edges:
+    settings = AlignmentConfig(alignment_edges=edges)
+    return align_pieces([a, b], [], links, settings, seed=0, advance=Counter())
 
 
 def test_pieces_that_share_images_are_joined_by_their_tracks() -> None:
@@ -99,7 +106,6 @@ def test_points_that_fit_while_cameras_disagree_are_refused() -> None:
         method=b.method,
         reprojection_error_px=0.3,
         tracks=b.tracks,
-        descriptors=b.descriptors,
     )
     (found,) = align(a, wrong).alignments
     assert not found.accepted
@@ -118,11 +124,74 @@ def test_only_pieces_that_could_meet_are_tried() -> None:
 
 def test_edges_come_back_from_disk_as_they_were(tmp_path) -> None:  # type: ignore[no-untyped-def]
     a, b, _ = two_pieces(range(12), range(6, 18))
-    edges = align(a, b)
+    edges = align(a, b, edges="both")
     write_edges(tmp_path, edges)
     back = read_edges(tmp_path)
-    np.testing.assert_array_equal(
-        back.alignments[0].estimate.b_from_a.matrix, edges.alignments[0].estimate.b_from_a.matrix
-    )
-    np.testing.assert_array_equal(back.alignments[0].estimate.information, edges.alignments[0].estimate.information)
-    assert back.alignments[0].reason == edges.alignments[0].reason
+    assert len(back.alignments) == len(edges.alignments) == 2
+    for found, wanted in zip(back.alignments, edges.alignments, strict=True):
+        np.testing.assert_allclose(found.estimate.b_from_a.matrix, wanted.estimate.b_from_a.matrix, rtol=1e-14)
+        np.testing.assert_array_equal(found.estimate.information, wanted.estimate.information)
+        np.testing.assert_array_equal(found.information, wanted.information)
+        assert (found.reason, found.evidence) == (wanted.reason, wanted.evidence)
+
+
+def test_shared_images_give_an_edge_from_points_and_one_from_cameras() -> None:
+    a, b, a_from_b = two_pieces(range(12), range(6, 18))
+    points, poses = align(a, b, edges="both").alignments
+    assert (points.evidence, poses.evidence) == ("tracks", "poses")
+    assert points.accepted
+    assert poses.accepted
+    for edge in (points, poses):
+        np.testing.assert_allclose(edge.estimate.b_from_a.matrix, a_from_b.matrix, rtol=1e-6, atol=1e-6)
+    (alone,) = align(a, b, edges="poses").alignments
+    assert alone.evidence == "poses"
+
+
+def test_cameras_that_deny_sound_points_are_refused() -> None:
+    a, b, _ = two_pieces(range(12), range(6, 18))
+    moved = b.seg_from_cam.copy()
+    moved[:, :, 3] += 0.15 * float(np.median(point_depths(b))) * moved[:, :, 2]  # every camera steps ahead
+    wrong = replace(b, seg_from_cam=moved)
+    points, poses = align(a, wrong, edges="both").alignments
+    assert points.accepted
+    assert not poses.accepted
+    assert "it denies the edge from tracks" in poses.reason
+
+
+def test_one_common_camera_gives_an_edge_from_points_only() -> None:
+    a, b, a_from_b = two_pieces(range(12), range(11, 18))
+    edges = align(a, b, edges="both")
+    (points,) = edges.alignments
+    np.testing.assert_allclose(points.estimate.b_from_a.matrix, a_from_b.matrix, rtol=1e-6, atol=1e-6)
+    (failure,) = edges.failures
+    assert failure.evidence == "poses"
+    assert "one camera (image 11)" in failure.reason
+
+
+def test_two_loops_are_never_aligned_and_no_loop_by_its_number() -> None:
+    world_from_cam, points = walk(20), points_ahead(20, np.random.default_rng(0))
+
+    def piece(images: tuple[int, ...], segment: int) -> SegmentPiece:
+        return make_piece(world_from_cam, images, points, Sim3.identity(), segment=segment)
+
+    pieces = [piece(tuple(range(6)), 0), piece(tuple(range(12, 18)), 1), piece((2, 3, 14), 2), piece((3, 4, 15), 3)]
+    assert candidate_pairs(pieces, {2, 3}) == ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3))
+    lonely = piece((8, 9), 2)
+    assert candidate_pairs([*pieces[:2], lonely], {2}) == ((0, 1),)
+
+
+@pytest.mark.parametrize("group", ["sim3", "se3", "affine3", "sl4"])
+def test_all_edges_of_a_run_are_in_its_group(group: TransformGroup) -> None:
+    rng = np.random.default_rng(3)
+    world_from_cam, points = walk(20), points_ahead(400, rng)
+    turned = Sim3(scale=np.ones(()), rotation=rotation_about_y(30.0), translation=np.array([1.0, 2.0, 3.0]))
+    a = make_piece(world_from_cam, tuple(range(12)), points, Sim3.identity())
+    b = make_piece(world_from_cam, tuple(range(6, 18)), points, turned, segment=1)
+    settings = AlignmentConfig(transform_group=group)
+    found = align_pieces([a, b], [], None, settings, seed=0, advance=Counter()).alignments
+    assert [edge.evidence for edge in found] == ["tracks", "poses"]
+    for edge in found:
+        assert edge.accepted, edge.reason
+        assert type(edge.estimate.b_from_a) is GROUPS[group]
+        assert edge.information.shape == (GROUPS[group].DOF,) * 2
+        np.testing.assert_allclose(edge.estimate.b_from_a.matrix, turned.inverse().matrix, rtol=1e-5, atol=1e-5)

@@ -17,20 +17,20 @@ from scenes import CAMERA, make_piece, points_ahead, rotation_about_y, walk
 from smust3r_colmap.backbones.classical import backbone as backbone_module
 from smust3r_colmap.backbones.classical import calibration
 from smust3r_colmap.backbones.classical import features as features_module
-from smust3r_colmap.backbones.classical.backbone import ClassicalBackbone
+from smust3r_colmap.backbones.classical.backbone import ClassicalBackbone, _RunFeatures
 from smust3r_colmap.backbones.classical.calibration import (
     CalibrationTask,
     agree_on_cameras,
     calibrate_segment,
     weighted_median,
 )
-from smust3r_colmap.backbones.classical.dense import DepthTask, make_no_depth
 from smust3r_colmap.backbones.classical.descriptors import vlad_descriptors
 from smust3r_colmap.backbones.classical.features import (
     _Features,
     _write_features,
     match_pairs,
     open_database,
+    plan_loop_pairs,
     plan_pairs,
     write_images,
 )
@@ -43,6 +43,7 @@ from smust3r_colmap.backbones.classical.model_checks import (
     find_denied_steps,
     find_hinges,
     find_jumps,
+    near_positions,
 )
 from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
 from smust3r_colmap.config import ClassicalConfig
@@ -53,7 +54,6 @@ from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.products import ImageCollection, Segment, SourceImage, Tracks
 from smust3r_colmap.progress import QuietReporter
 from smust3r_colmap.run_directory import RunDirectory
-from smust3r_colmap.stored_maps import StoredMaps
 
 NUM_IMAGES = 8
 
@@ -93,19 +93,19 @@ def strong_neighbours(num_images: int) -> dict[tuple[int, int], int]:
 
 
 def test_an_honest_walk_has_no_jumps() -> None:
-    assert find_jumps(model_of_walk(12), range(12), strong_neighbours(12)) == []
+    assert find_jumps(model_of_walk(12), strong_neighbours(12)) == []
 
 
 def test_a_turn_between_matching_neighbours_is_a_jump() -> None:
     model = model_of_walk(12)
     model.seg_from_cam[7:, :, :3] = model.seg_from_cam[7:, :, :3] @ rotation_about_y(150.0)
-    assert find_jumps(model, range(12), strong_neighbours(12)) == [6]
+    assert find_jumps(model, strong_neighbours(12)) == [6]
 
 
 def test_a_leap_between_matching_neighbours_is_a_jump() -> None:
     model = model_of_walk(12)
     model.seg_from_cam[5:, 0, 3] += 15.0
-    assert find_jumps(model, range(12), strong_neighbours(12)) == [4]
+    assert find_jumps(model, strong_neighbours(12)) == [4]
 
 
 def test_neighbours_that_do_not_match_may_stand_apart() -> None:
@@ -113,14 +113,22 @@ def test_neighbours_that_do_not_match_may_stand_apart() -> None:
     model.seg_from_cam[5:, 0, 3] += 15.0
     pairs = strong_neighbours(12)
     pairs[4, 5] = 12
-    assert find_jumps(model, range(12), pairs) == []
+    assert find_jumps(model, pairs) == []
 
 
 def test_moving_on_after_a_pause_is_not_a_jump() -> None:
     model = model_of_walk(12)
     model.seg_from_cam[:, 0, 3] *= 1e-3
     model.seg_from_cam[6:, 0, 3] += 0.5
-    assert find_jumps(model, range(12), strong_neighbours(12)) == []
+    assert find_jumps(model, strong_neighbours(12)) == []
+
+
+def test_the_two_ends_of_a_loop_are_not_neighbours() -> None:
+    assert list(near_positions((3, 4, 5, 40, 41))) == [(0, 1), (0, 2), (1, 2), (3, 4)]
+    model = model_of_walk(12)
+    model.seg_from_cam[5:, 0, 3] += 15.0
+    far = replace(model, images=(*range(5), *range(40, 47)))
+    assert find_jumps(far, {**strong_neighbours(47), (4, 40): 500}) == []
 
 
 def test_a_restricted_model_keeps_points_that_two_images_see() -> None:
@@ -278,11 +286,11 @@ def test_a_model_that_its_matches_deny_is_broken_at_that_step(
     (model,) = map_segment(task).models
     inliers = dict.fromkeys(task.pairs, 200)
     with open_database(task.database) as database:
-        assert find_jumps(model, task.images, inliers)
-        assert find_denied_steps(model, task.images, inliers, database) == []
+        assert find_jumps(model, inliers)
+        assert find_denied_steps(model, inliers, database) == []
         model.seg_from_cam[5:, :, :3] = model.seg_from_cam[5:, :, :3] @ rotation_about_y(25.0)
-        assert 4 in find_denied_steps(model, task.images, inliers, database)
-        assert not {0, 1, 2} & set(find_denied_steps(model, task.images, inliers, database))
+        assert 4 in find_denied_steps(model, inliers, database)
+        assert not {0, 1, 2} & set(find_denied_steps(model, inliers, database))
 
 
 # ---------------------------------------------------------------------- calibration
@@ -423,12 +431,12 @@ def one_failure(*_: object, **__: object) -> Iterator[TaskResult[MappedSegment]]
 def test_a_segment_that_failed_is_tried_again_at_the_next_start(
     synthetic: tuple[MappingTask, pycolmap.Reconstruction], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    backbone = ClassicalBackbone(ClassicalConfig(), workers=1, seed=0)
     kept = read_only_segment(0, model_of_walk(6))
     monkeypatch.setattr(backbone_module, "map_tasks", one_failure)
     with RunDirectory(tmp_path / "out") as run, QuietReporter(sys.stderr).stage("mapping", total=1) as stage:
+        backbone = backbone_of(synthetic[0], run)
         folder = run.stage("segments", "0000", "calibrated", key="k")
-        (found,) = backbone._finish(map_segment, [synthetic[0]], [folder], [kept], run, stage)
+        (found,) = backbone._finish(map_segment, [synthetic[0]], [folder], [kept], stage)
         assert not folder.is_done
     assert found.models == kept.models
     assert found.attempts == ("calibrated: out of memory",)
@@ -444,25 +452,55 @@ def test_a_global_mapper_that_kills_its_process_costs_only_its_own_rung(
     synthetic: tuple[MappingTask, pycolmap.Reconstruction], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(backbone_module, "map_segment", die_in_the_global_mapper)
-    image = SourceImage(name="0", path=tmp_path / "0", width=640, height=480, camera=0, digest="0")
-    collection = ImageCollection(
-        images=tuple(replace(image, name=str(k)) for k in range(NUM_IMAGES)), cameras=(CAMERA,)
-    )
-    backbone = ClassicalBackbone(ClassicalConfig(), workers=1, seed=0)
+    task = synthetic[0]
     with RunDirectory(tmp_path / "out") as run:
-        (mapped,) = backbone._map([synthetic[0]], collection, run, "features", QuietReporter(sys.stderr))
+        (mapped,) = backbone_of(task, run)._map([Segment(index=0, images=task.images)], {0: task.pairs})
     assert mapped.models[0].images == tuple(range(6))
 
 
-def test_a_sweep_that_failed_leaves_readable_empty_maps_and_is_tried_again(tmp_path: Path) -> None:
+def backbone_of(task: MappingTask, run: RunDirectory) -> ClassicalBackbone:
+    """A backbone whose features are in the database of a task."""
+    image = SourceImage(name="0", path=run.root / "0", width=640, height=480, camera=0, digest="0")
+    collection = ImageCollection(
+        images=tuple(replace(image, name=str(k)) for k in range(NUM_IMAGES)), cameras=(CAMERA,)
+    )
+    backbone = ClassicalBackbone(collection, ClassicalConfig(), run, QuietReporter(sys.stderr), workers=1, seed=0)
+    backbone._features = _RunFeatures(database=task.database, key="features", usable=(True,) * NUM_IMAGES, rejected=())
+    return backbone
+
+
+def test_a_sweep_that_failed_leaves_readable_empty_maps_and_is_tried_again(
+    synthetic: tuple[MappingTask, pycolmap.Reconstruction], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(backbone_module, "map_tasks", one_failure)
     piece = make_piece(walk(3), (0, 1, 2), points_ahead(9, np.random.default_rng(0)), Sim3.identity())
     with RunDirectory(tmp_path / "out") as run:
-        folder = run.stage("segments", "0000", "depth_0", key="k")
-        make_no_depth(DepthTask(piece=piece, images=(), folder=folder, dense_size=64, planes=8))
-        assert not folder.is_done
-        maps = StoredMaps(folder.path, piece)
-        assert maps.depth(2).shape == (48, 64)
-        assert not maps.depth(2).any()
+        backbone = backbone_of(synthetic[0], run)
+        (maps,), _ = backbone._dense([piece], with_maps=[piece.segment])
+        assert not backbone._depth_task(piece).folder.is_done
+    assert len(maps) == 3
+    assert maps.depth(2).shape == (288, 384)
+    assert not maps.depth(2).any()
+    assert (maps.confidence(2) == 1).all()
+    assert np.isnan(maps.pointmap_seg(2)).all()
+    assert maps.rgb(2).shape == (288, 384, 3)
+
+
+def test_a_loop_pairs_each_end_like_a_window_and_across_the_most_alike() -> None:
+    ends = (*range(10, 31), *range(70, 91))
+    descriptors = np.zeros((100, 64), np.float32)
+    for k in range(21):  # image 10 + k shows what image 70 + k shows, and a little of the next ones
+        descriptors[10 + k, 2 * k : 2 * k + 4] = descriptors[70 + k, 2 * k : 2 * k + 4] = 0.5
+    pairs = plan_loop_pairs(Segment(index=3, images=ends, kind="loop"), descriptors, neighbours=3)
+    window = set(plan_pairs(Segment(index=0, images=tuple(range(60))), neighbours=3, exhaustive_below=25))
+    across = {pair for pair in pairs if pair[0] < 60 <= pair[1]}
+    inside = set(pairs) - across
+    assert len(pairs) == len(set(pairs))
+    assert {pair for pair in inside if pair[1] < 60} <= window
+    assert len(inside) == 2 * (20 + 19 + 18 + 17 + 13 + 5)
+    assert {(10 + k, 70 + k + step) for k in range(1, 20) for step in (-1, 0, 1)} <= across
+    assert all(first < second for first, second in pairs)
+    assert len(across) < 90
 
 
 # ---------------------------------------------------------------------- descriptors

@@ -16,7 +16,16 @@ import pytest
 import trimesh
 from read_colmap_independently import read_binary
 
-from smust3r_colmap.config import ClassicalConfig, FusionConfig, OutputConfig, RunConfig, SegmentationConfig
+from smust3r_colmap.config import (
+    AlignmentConfig,
+    ClassicalConfig,
+    FusionConfig,
+    LoopConfig,
+    OutputConfig,
+    RunConfig,
+    SegmentationConfig,
+    TransformGroup,
+)
 from smust3r_colmap.demo import DemoScene, demo_intrinsics, write_demo
 from smust3r_colmap.errors import ConfigError, ReconstructionError
 from smust3r_colmap.evaluation import compare_trajectories, read_poses_txt, read_reference_sparse
@@ -120,7 +129,7 @@ def test_a_second_start_repeats_nothing_and_gives_the_same_model(finished: RunSu
     again = run(room / "images", finished.output)
     assert (finished.output / "sparse/0/images.bin").read_bytes() == before
     computed = {name for name, was_reused in reused(again).items() if not was_reused}
-    assert computed == {"import", "export"}
+    assert computed == {"import", "pose graph", "export"}
 
 
 def test_a_changed_setting_redoes_its_stage_and_what_follows(finished: RunSummary, room: Path, tmp_path: Path) -> None:
@@ -129,7 +138,7 @@ def test_a_changed_setting_redoes_its_stage_and_what_follows(finished: RunSummar
     denser = replace(CONFIG, classical=replace(CONFIG.classical, dense_size=120))
     again = reused(run(room / "images", copy, denser))
     assert {name for name, was_reused in again.items() if was_reused} == {
-        "features", "matching", "mapping", "calibration", "alignment",
+        "features", "loops", "matching", "mapping", "calibration", "alignment",
     }  # fmt: skip
     fewer_points = replace(denser, fusion=FusionConfig(max_points=5_000))
     again = reused(run(room / "images", copy, fewer_points))
@@ -274,3 +283,57 @@ def test_an_output_among_the_images_is_refused(room: Path) -> None:
     with pytest.raises(ConfigError, match="inside the image folder"):
         run(room / "images", room / "images" / "out")
     assert not (room / "images/out").exists()
+
+
+# ----------------------------------------------------------------------------- loops
+ROUND = replace(CONFIG, segmentation=SegmentationConfig(segment_length=12, overlap=6))
+
+
+@pytest.fixture(scope="module")
+def round_trip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("round")
+    write_demo(folder, num_images=48, width=320, height=240)
+    return folder
+
+
+def test_a_walk_that_comes_back_is_closed_and_a_run_without_loops_is_not(round_trip: Path, tmp_path: Path) -> None:
+    summary = run(round_trip / "images", tmp_path / "out", ROUND)
+    assert len(summary.models) == 1
+    closed = [loop for loop in summary.loops if loop.accepted]
+    assert closed, [loop.reason for loop in summary.loops]
+    assert all(loop.segment_b - loop.segment_a >= 3 for loop in closed)
+    assert all(0 <= loop.gap_after_percent < max(loop.gap_before_percent, 0.5) for loop in closed)
+    assert summary.graph.num_loops == len(closed)
+    assert summary.graph.cost_after <= summary.graph.cost_before
+    assert {segment.kind for segment in summary.segments} == {"window", "loop"}
+    plan = json.loads((tmp_path / "out/work/loops/plan.json").read_text())
+    assert sum(candidate["taken"] for candidate in plan["candidates"]) == len(summary.loops)
+    assert all(candidate["reason"] for candidate in plan["candidates"])
+    truth = read_poses_txt(round_trip / "poses.txt")
+    found = compare_trajectories(read_reference_sparse(tmp_path / "out/sparse/0"), truth)
+    assert found.num_compared == summary.num_registered == 48
+    assert found.position_rmse < 0.02
+    before = np.loadtxt(tmp_path / "out/trajectory_without_loops_tum.txt")
+    after = np.loadtxt(tmp_path / "out/trajectory_tum.txt")
+    assert before.shape == after.shape == (48, 8)
+    assert not np.allclose(before[:, 1:], after[:, 1:], atol=1e-6)
+
+    without = replace(ROUND, loop_closing=LoopConfig(loops=False))
+    plain = run(round_trip / "images", tmp_path / "out", without)
+    assert plain.loops == ()
+    assert plain.graph.num_loops == 0
+    assert not (tmp_path / "out/trajectory_without_loops_tum.txt").exists()
+    assert all(was_reused for name, was_reused in reused(plain).items() if name in {"features", "mapping", "depth"})
+
+
+@pytest.mark.parametrize("group", ["affine3", "sl4"])
+def test_groups_that_bend_still_place_every_camera(
+    group: TransformGroup, finished: RunSummary, room: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(finished.output, tmp_path / "out")
+    bending = replace(CONFIG, alignment=AlignmentConfig(transform_group=group))
+    summary = run(room / "images", tmp_path / "out", bending)
+    assert all(was_reused for name, was_reused in reused(summary).items() if name in {"features", "mapping", "depth"})
+    found = compare_trajectories(read_reference_sparse(tmp_path / "out/sparse/0"), read_poses_txt(room / "poses.txt"))
+    assert found.num_compared == NUM_IMAGES
+    assert found.position_rmse < 0.05

@@ -48,12 +48,9 @@ def honest(
     num_images: int = 30,
     centre: FloatArray = CENTRE,
     depth: float = DEPTH,
-    num_edges: int = 1,
     group: type[Transform] | None = None,
 ) -> FloatArray:
-    return honest_information(
-        estimate, num_images=num_images, centre_source=centre, depth_source=depth, num_edges=num_edges, group=group
-    )
+    return honest_information(estimate, num_images=num_images, centre_source=centre, depth_source=depth, group=group)
 
 
 def some_information(dof: int, *, size: float = 1e4) -> FloatArray:
@@ -124,11 +121,6 @@ def test_fewer_rows_than_count_are_not_made_more() -> None:
     )
 
 
-def test_two_edges_of_a_pair_are_one_witness() -> None:
-    estimate = estimate_of(Sim3.identity(), some_information(7))
-    np.testing.assert_allclose(2 * honest(estimate, num_edges=2), honest(estimate), rtol=1e-12)
-
-
 # --------------------------------------------------------------------------------- frames
 @pytest.mark.parametrize(
     ("group", "factor"),
@@ -194,8 +186,7 @@ def test_shear_between_pieces_related_by_a_similarity_is_vaguely_none() -> None:
     [
         ({"depth": 0.0}, "depth 0.0, 30 shared images"),
         ({"depth": np.nan}, "depth nan, 30 shared images"),
-        ({"num_images": 0}, "0 shared images, 1000 rows, 1 edges: all must be positive"),
-        ({"num_edges": 0}, "0 edges: all must be positive"),
+        ({"num_images": 0}, "0 shared images, 1000 rows: all must be positive"),
         ({"group": GROUPS["se3"]}, "(7, 7) of a transform in Sim3 for SE3 (6 degrees of freedom)"),
     ],
 )

@@ -1,1 +1,2 @@
-"""Sim(3) between segments that share images. ``irls`` has the estimator, the others find correspondences."""
+"""Transforms between segments that share images. ``irls`` has the solver, ``seen_points`` chooses the group,
+the others find correspondences."""

@@ -21,7 +21,7 @@ percent of the depth), and its squared length in standard deviations over 7, whi
 
 The two edges of one pair agree ten times better with each other than with the truth (median over the
 sets 0.03 to 0.2 degrees, 0.01 to 0.7 %, 0.01 to 0.6 %): they share the bend of the pieces. So they are
-no two witnesses, and ``honest_information`` divides what one edge says by the number of edges.
+no two witnesses: the pose graph (``stitching``) divides what they say by their number.
 """
 
 from __future__ import annotations
@@ -47,7 +47,6 @@ def honest_information(
     num_images: int,
     centre_source: FloatArray,
     depth_source: float,
-    num_edges: int = 1,
     group: type[Transform] | None = None,
 ) -> FloatArray:
     """Information of an edge that may be weighed against others.
@@ -63,7 +62,6 @@ def honest_information(
         num_images: shared by the two pieces.
         centre_source: (3,) middle of the overlap in the source frame, such as ``overlap_centre``.
         depth_source: median depth of the scene there, in units of the source.
-        num_edges: between the same two pieces, this one included.
         group: of the pose graph, where the estimate's own is a smaller one; directions that the
             smaller one lacks get the standard deviation ``UNKNOWN``.
 
@@ -77,11 +75,9 @@ def honest_information(
     """
     own = type(estimate.b_from_a)
     wide = own if group is None else group
-    counts = (num_images, estimate.num_points, num_edges)
-    if not (np.isfinite(depth_source) and depth_source > 0) or min(counts) < 1:
+    if not (np.isfinite(depth_source) and depth_source > 0) or num_images < 1 or estimate.num_points < 1:
         raise ValueError(
-            f"depth {depth_source}, {num_images} shared images, {estimate.num_points} rows, {num_edges} edges: "
-            "all must be positive"
+            f"depth {depth_source}, {num_images} shared images, {estimate.num_points} rows: all must be positive"
         )
     if estimate.information.shape != (own.DOF, own.DOF) or wide.DOF < own.DOF:
         raise ValueError(
@@ -97,7 +93,7 @@ def honest_information(
     values, axes = np.linalg.eigh(whitened)
     values = np.maximum(values, 0.0)
     back = axes.T @ np.linalg.inv(_usual_errors(wide, centre_source, depth_source))
-    information: FloatArray = (back.T * (values / (values + 1.0) / num_edges)) @ back
+    information: FloatArray = (back.T * (values / (values + 1.0))) @ back
     return information
 
 

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
 
 from smust3r_colmap.products import (
     DenseMaps,
     FeatureLinks,
-    ImageCollection,
     RejectedImage,
     Segment,
     SegmentPiece,
     SegmentReconstruction,
 )
-from smust3r_colmap.progress import Reporter
-from smust3r_colmap.run_directory import RunDirectory
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,12 +48,23 @@ class BackboneResult:
 
 
 class Backbone(Protocol):
-    """Reconstructs every segment alone; keeps what it finished in the run directory."""
+    """Reconstructs every segment of one collection alone; made for the run, and keeps what it finished."""
 
     name: str
     metric: bool
+    has_tracks: bool
+    """Pieces come with feature tracks, so that they can be aligned without maps."""
 
-    def reconstruct(
-        self, collection: ImageCollection, segments: Sequence[Segment], run: RunDirectory, reporter: Reporter
-    ) -> BackboneResult:
-        """All segments. Geometry that does not come out is recorded in the result, never raised."""
+    def describe(self) -> npt.NDArray[np.float32]:
+        """(N, D) one vector of unit length per image of the collection; zero where an image gave none.
+
+        Cosines between them tell which images may show one place (paper section III-F).
+        """
+
+    def reconstruct(self, segments: Sequence[Segment], *, with_maps: Collection[int]) -> BackboneResult:
+        """All segments. Geometry that does not come out is recorded in the result, never raised.
+
+        Args:
+            segments: of the run, windows and loops; ``segments[k].index == k``.
+            with_maps: indices of the segments whose dense maps will be read; those of the others may be empty.
+        """

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
@@ -13,7 +14,7 @@ import numpy.typing as npt
 
 from smust3r_colmap.backbones.base import BackboneResult
 from smust3r_colmap.backbones.classical.calibration import CalibrationTask, agree_on_cameras, calibrate_segment
-from smust3r_colmap.backbones.classical.dense import DepthTask, make_depth, make_no_depth
+from smust3r_colmap.backbones.classical.dense import DepthTask, make_depth
 from smust3r_colmap.backbones.classical.descriptors import vlad_descriptors
 from smust3r_colmap.backbones.classical.features import (
     Pair,
@@ -21,6 +22,7 @@ from smust3r_colmap.backbones.classical.features import (
     extract_features,
     match_pairs,
     open_database,
+    plan_loop_pairs,
     plan_pairs,
 )
 from smust3r_colmap.backbones.classical.mapping import MappedSegment, MappingTask, map_segment
@@ -28,6 +30,7 @@ from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
 from smust3r_colmap.config import ClassicalConfig
 from smust3r_colmap.execution import TaskFailure, map_tasks
 from smust3r_colmap.products import (
+    DenseMaps,
     FeatureLinks,
     ImageCollection,
     RejectedImage,
@@ -38,163 +41,182 @@ from smust3r_colmap.products import (
 )
 from smust3r_colmap.progress import Reporter, Stage
 from smust3r_colmap.run_directory import RunDirectory, StageFolder, key_of, read_arrays, write_arrays
-from smust3r_colmap.stored_maps import StoredMaps
+from smust3r_colmap.stored_maps import EmptyMaps, StoredMaps
 
 logger = logging.getLogger(__name__)
 
 TaskT = TypeVar("TaskT")
 
 
+@dataclass(frozen=True, kw_only=True)
+class _RunFeatures:
+    """The run's database; which images have features, and why the others have none."""
+
+    database: Path
+    key: str
+    usable: tuple[bool, ...]
+    rejected: tuple[RejectedImage, ...]
+
+
 class ClassicalBackbone:
     """SIFT, mapping inside the segment, one calibration for the run, plane-sweep depth.
 
     Args:
+        collection: the images of the run.
         config: settings of the backbone.
+        run: where finished work is kept.
+        reporter: told about every stage.
         workers: processes, at least one.
         seed: of every sampler.
     """
 
     name = "classical"
     metric = False
+    has_tracks = True
 
-    def __init__(self, config: ClassicalConfig, *, workers: int, seed: int) -> None:
+    def __init__(
+        self,
+        collection: ImageCollection,
+        config: ClassicalConfig,
+        run: RunDirectory,
+        reporter: Reporter,
+        *,
+        workers: int,
+        seed: int,
+    ) -> None:
+        self.collection = collection
         self.config = config
+        self.run = run
+        self.reporter = reporter
         self.workers = workers
         self.seed = seed
 
-    def reconstruct(
-        self, collection: ImageCollection, segments: Sequence[Segment], run: RunDirectory, reporter: Reporter
-    ) -> BackboneResult:
-        """All segments of the run; see ``Backbone``."""
-        features = self._features_stage(collection, run)
-        database = features.open_in_place() / "database.db"
-        rejected = self._extract(database, collection, run, reporter)
-        lost = {image.name for image in rejected}
-        usable = [image.name not in lost for image in collection.images]
-        pairs = self._match(database, segments, usable, run, reporter)
-        descriptors = self._descriptors(database, usable, run, features.key)
-        tasks = [self._mapping_task(segment, pairs[segment.index], database, collection) for segment in segments]
-        mapped = self._map(tasks, collection, run, features.key, reporter)
-        reconstructions = [_reconstruction(one, descriptors) for one in mapped]
-        dense, dense_key = self._dense([p for r in reconstructions for p in r.pieces], collection, run, reporter)
-        return BackboneResult(
-            reconstructions=tuple(reconstructions),
-            dense=dense,
-            dense_key=dense_key,
-            links=_read_links(database, sorted(set().union(*pairs.values()))),
-            rejected=rejected,
-        )
-
-    # ------------------------------------------------------------- once in the run
-    def _pairs(self, segment: Segment) -> tuple[Pair, ...]:
-        return plan_pairs(
-            segment, neighbours=self.config.match_neighbours, exhaustive_below=self.config.exhaustive_below
-        )
-
-    def _features_stage(self, collection: ImageCollection, run: RunDirectory) -> StageFolder:
-        images = [(image.digest, image.width, image.height, image.camera) for image in collection.images]
-        key = key_of(
-            "features", images, collection.cameras, self.config.max_image_size, self.config.max_features, self.seed
-        )
-        return run.stage("features", key=key)
-
-    def _extract(
-        self, database: Path, collection: ImageCollection, run: RunDirectory, reporter: Reporter
-    ) -> tuple[RejectedImage, ...]:
-        create_database(database, collection)
-        with reporter.stage("features", total=len(collection)) as stage:
-            rejected = extract_features(
-                database,
-                collection,
-                max_image_size=self.config.max_image_size,
-                max_features=self.config.max_features,
-                workers=self.workers,
-                log_file=run.native_log,
-                stage=stage,
-            )
-        for image in rejected:
-            reporter.warn(f"no features: {image.name} ({image.reason})")
-        return rejected
-
-    def _match(
-        self, database: Path, segments: Sequence[Segment], usable: Sequence[bool], run: RunDirectory, reporter: Reporter
-    ) -> dict[int, tuple[Pair, ...]]:
-        """The matched pairs by segment. Pairs that failed are in no key, so what comes later is not final either."""
-        plan = {
-            segment.index: [(a, b) for a, b in self._pairs(segment) if usable[a] and usable[b]] for segment in segments
-        }
-        every_pair = {pair for pairs in plan.values() for pair in pairs}
-        with reporter.stage("matching", total=len(every_pair)) as stage:
-            matched = match_pairs(
-                database, every_pair, workers=self.workers, seed=self.seed, log_file=run.native_log, stage=stage
-            )
-        return {index: tuple(pair for pair in pairs if pair in matched) for index, pairs in plan.items()}
-
-    def _descriptors(
-        self, database: Path, usable: Sequence[bool], run: RunDirectory, features_key: str
-    ) -> npt.NDArray[np.float32]:
-        """(N, D) descriptors of all images, made once."""
-        stage = run.stage("descriptors", key=key_of("descriptors", features_key, usable, self.seed))
+    def describe(self) -> npt.NDArray[np.float32]:
+        """VLAD of the SIFT features of every image; see ``Backbone``."""
+        features = self._features
+        stage = self.run.stage("descriptors", key=key_of("descriptors", features.key, features.usable, self.seed))
         if not stage.is_done:
-            with open_database(database) as opened:
-                sift = [np.asarray(opened.read_descriptors(i + 1).data).reshape(-1, 128) for i in range(len(usable))]
+            with open_database(features.database) as opened:
+                numbers = range(1, len(self.collection) + 1)
+                sift = [np.asarray(opened.read_descriptors(number).data).reshape(-1, 128) for number in numbers]
             made = vlad_descriptors(sift, rng=np.random.default_rng(self.seed))
             with stage.write() as folder:
                 write_arrays(folder / "descriptors.safetensors", {"vlad": made})
         vlad: npt.NDArray[np.float32] = read_arrays(stage.path / "descriptors.safetensors")["vlad"]
         return vlad
 
-    # --------------------------------------------------------------- every segment
-    def _mapping_task(
-        self, segment: Segment, pairs: tuple[Pair, ...], database: Path, collection: ImageCollection
-    ) -> MappingTask:
-        return MappingTask(
-            segment=segment.index,
-            database=database,
-            images=segment.images,
-            camera_indices=tuple(collection.images[i].camera for i in segment.images),
-            pairs=pairs,
-            cameras=collection.cameras,
-            trusted_focal={},
-            seed=self.seed,
+    def reconstruct(self, segments: Sequence[Segment], *, with_maps: Collection[int]) -> BackboneResult:
+        """All segments of the run; see ``Backbone``."""
+        pairs = self._match(segments)
+        mapped = self._map(segments, pairs)
+        reconstructions = [_reconstruction(one) for one in mapped]
+        dense, dense_key = self._dense([p for r in reconstructions for p in r.pieces], with_maps)
+        return BackboneResult(
+            reconstructions=tuple(reconstructions),
+            dense=dense,
+            dense_key=dense_key,
+            links=_read_links(self._features.database, sorted(set().union(*pairs.values()))),
+            rejected=self._features.rejected,
         )
 
-    def _map(
-        self,
-        tasks: Sequence[MappingTask],
-        collection: ImageCollection,
-        run: RunDirectory,
-        features_key: str,
-        reporter: Reporter,
-    ) -> list[MappedSegment]:
-        """Map every segment freely, agree on the cameras, bring every segment to them."""
-        keys = [key_of("mapping", features_key, task.images, task.pairs, self.seed) for task in tasks]
-        folders = [_segment_stage(run, task.segment, "mapping", key) for task, key in zip(tasks, keys, strict=True)]
-        with reporter.stage("mapping", total=len(tasks)) as stage:
-            mapped = self._finish(map_segment, tasks, folders, [_nothing(task) for task in tasks], run, stage)
+    # ------------------------------------------------------------- once in the run
+    @cached_property
+    def _features(self) -> _RunFeatures:
+        """Extract what no earlier start extracted."""
+        images = [(image.digest, image.width, image.height, image.camera) for image in self.collection.images]
+        settings = (self.config.max_image_size, self.config.max_features, self.seed)
+        stored = self.run.stage("features", key=key_of("features", images, self.collection.cameras, *settings))
+        database = stored.open_in_place() / "database.db"
+        create_database(database, self.collection)
+        with self.reporter.stage("features", total=len(self.collection)) as stage:
+            rejected = extract_features(
+                database,
+                self.collection,
+                max_image_size=self.config.max_image_size,
+                max_features=self.config.max_features,
+                workers=self.workers,
+                log_file=self.run.native_log,
+                stage=stage,
+            )
+        for image in rejected:
+            self.reporter.warn(f"no features: {image.name} ({image.reason})")
+        lost = {image.name for image in rejected}
+        usable = tuple(image.name not in lost for image in self.collection.images)
+        return _RunFeatures(database=database, key=stored.key, usable=usable, rejected=rejected)
+
+    def _match(self, segments: Sequence[Segment]) -> dict[int, tuple[Pair, ...]]:
+        """The matched pairs by segment. Pairs that failed are in no key, so what comes later is not final either."""
+        usable = self._features.usable
+        plan = {
+            segment.index: [(a, b) for a, b in self._pairs(segment) if usable[a] and usable[b]] for segment in segments
+        }
+        every_pair = {pair for pairs in plan.values() for pair in pairs}
+        with self.reporter.stage("matching", total=len(every_pair)) as stage:
+            matched = match_pairs(
+                self._features.database,
+                every_pair,
+                workers=self.workers,
+                seed=self.seed,
+                log_file=self.run.native_log,
+                stage=stage,
+            )
+        return {index: tuple(pair for pair in pairs if pair in matched) for index, pairs in plan.items()}
+
+    def _pairs(self, segment: Segment) -> tuple[Pair, ...]:
+        neighbours = self.config.match_neighbours
+        if segment.kind == "loop":
+            return plan_loop_pairs(segment, self.describe(), neighbours=neighbours)
+        return plan_pairs(segment, neighbours=neighbours, exhaustive_below=self.config.exhaustive_below)
+
+    # --------------------------------------------------------------- every segment
+    def _map(self, segments: Sequence[Segment], pairs: Mapping[int, tuple[Pair, ...]]) -> list[MappedSegment]:
+        """Map every segment freely, agree on the cameras, bring every segment to them.
+
+        Windows alone have a say about the cameras, so a loop that is found later changes no window.
+        """
+        tasks = [self._mapping_task(segment, pairs[segment.index]) for segment in segments]
+        keys = [key_of("mapping", self._features.key, task.images, task.pairs, self.seed) for task in tasks]
+        folders = [self._segment_stage(task.segment, "mapping", key) for task, key in zip(tasks, keys, strict=True)]
+        with self.reporter.stage("mapping", total=len(tasks)) as stage:
+            mapped = self._finish(map_segment, tasks, folders, [_nothing(task) for task in tasks], stage)
         crashed = [k for k, one in enumerate(mapped) if not one.models and not folders[k].is_done]
         if crashed:
-            with reporter.stage("mapping without the global mapper", total=len(crashed)) as stage:
+            with self.reporter.stage("mapping without the global mapper", total=len(crashed)) as stage:
                 careful = [replace(tasks[k], use_global=False) for k in crashed]
                 again = self._finish(
-                    map_segment, careful, [folders[k] for k in crashed], [mapped[k] for k in crashed], run, stage
+                    map_segment, careful, [folders[k] for k in crashed], [mapped[k] for k in crashed], stage
                 )
             for k, one in zip(crashed, again, strict=True):
                 mapped[k] = one
-        agreed = agree_on_cameras(mapped, [image.camera for image in collection.images], collection.cameras)
+        windows = [one for one, segment in zip(mapped, segments, strict=True) if segment.kind == "window"]
+        agreed = agree_on_cameras(windows, [image.camera for image in self.collection.images], self.collection.cameras)
         for camera, intrinsics in agreed.items():
-            reporter.note(f"camera {camera + 1}: the segments agree on a focal length of {intrinsics.focal_px:.1f} px")
+            self.reporter.note(
+                f"camera {camera + 1}: the segments agree on a focal length of {intrinsics.focal_px:.1f} px"
+            )
         chosen = [k for k, one in enumerate(mapped) if one.models]
         keys = [key_of("calibrated", keys[k], sorted(agreed.items())) for k in chosen]
         folders = [
-            _segment_stage(run, mapped[k].segment, "calibrated", key) for k, key in zip(chosen, keys, strict=True)
+            self._segment_stage(mapped[k].segment, "calibrated", key) for k, key in zip(chosen, keys, strict=True)
         ]
         calibrations = [CalibrationTask(mapping=tasks[k], mapped=mapped[k], agreed=agreed) for k in chosen]
-        with reporter.stage("calibration", total=len(chosen)) as stage:
-            calibrated = self._finish(calibrate_segment, calibrations, folders, [mapped[k] for k in chosen], run, stage)
+        with self.reporter.stage("calibration", total=len(chosen)) as stage:
+            calibrated = self._finish(calibrate_segment, calibrations, folders, [mapped[k] for k in chosen], stage)
         for k, one in zip(chosen, calibrated, strict=True):
             mapped[k] = one
         return mapped
+
+    def _mapping_task(self, segment: Segment, pairs: tuple[Pair, ...]) -> MappingTask:
+        return MappingTask(
+            segment=segment.index,
+            database=self._features.database,
+            images=segment.images,
+            camera_indices=tuple(self.collection.images[i].camera for i in segment.images),
+            pairs=pairs,
+            cameras=self.collection.cameras,
+            trusted_focal={},
+            seed=self.seed,
+        )
 
     def _finish(
         self,
@@ -202,7 +224,6 @@ class ClassicalBackbone:
         tasks: Sequence[TaskT],
         folders: Sequence[StageFolder],
         otherwise: Sequence[MappedSegment],
-        run: RunDirectory,
         stage: Stage,
     ) -> list[MappedSegment]:
         """Run what no earlier start finished, store it, and return everything in order.
@@ -213,7 +234,8 @@ class ClassicalBackbone:
         missing = [k for k, folder in enumerate(folders) if not folder.is_done]
         stage.skip(len(tasks) - len(missing))
         failed = {}
-        for result in map_tasks(function, [tasks[k] for k in missing], workers=self.workers, log_file=run.native_log):
+        todo = [tasks[k] for k in missing]
+        for result in map_tasks(function, todo, workers=self.workers, log_file=self.run.native_log):
             k = missing[result.index]
             if isinstance(result.value, TaskFailure):
                 failed[k] = _with_failure(otherwise[k], folders[k].path.name, result.value)
@@ -224,42 +246,40 @@ class ClassicalBackbone:
             stage.advance()
         return [failed[k] if k in failed else read_mapped(folder.path) for k, folder in enumerate(folders)]
 
-    def _dense(
-        self, pieces: Sequence[SegmentPiece], collection: ImageCollection, run: RunDirectory, reporter: Reporter
-    ) -> tuple[tuple[StoredMaps, ...], str]:
+    def _dense(self, pieces: Sequence[SegmentPiece], with_maps: Collection[int]) -> tuple[tuple[DenseMaps, ...], str]:
         """Maps of every piece and their common key; a piece whose sweep failed gets empty ones and a warning."""
-        tasks = []
-        for piece in pieces:
-            images = tuple(collection.images[i] for i in piece.images)
-            geometry = (piece.seg_from_cam, piece.intrinsics, piece.tracks)
-            key = key_of(
-                "depth", [i.digest for i in images], geometry, self.config.dense_size, self.config.depth_planes
-            )
-            tasks.append(
-                DepthTask(
-                    piece=piece,
-                    images=images,
-                    folder=_segment_stage(run, piece.segment, f"depth_{piece.piece}", key),
-                    dense_size=self.config.dense_size,
-                    planes=self.config.depth_planes,
-                )
-            )
-        missing = [task for task in tasks if not task.folder.is_done]
-        total = sum(len(piece.images) for piece in pieces)
-        with reporter.stage("depth", total=total) as stage:
+        tasks = [self._depth_task(piece) for piece in pieces]
+        wanted = [task for task in tasks if task.piece.segment in with_maps]
+        missing = [task for task in wanted if not task.folder.is_done]
+        total = sum(len(task.images) for task in wanted)
+        with self.reporter.stage("depth", total=total) as stage:
             stage.skip(total - sum(len(task.images) for task in missing))
-            for result in map_tasks(make_depth, missing, workers=self.workers, log_file=run.native_log):
+            for result in map_tasks(make_depth, missing, workers=self.workers, log_file=self.run.native_log):
                 task = missing[result.index]
                 if isinstance(result.value, TaskFailure):
-                    reporter.warn(f"segment {task.piece.name} has no depth maps: {result.value.reason}")
-                    make_no_depth(task)
+                    self.reporter.warn(f"segment {task.piece.name} has no depth maps: {result.value.reason}")
                 stage.advance(len(task.images))
-        maps = tuple(StoredMaps(task.folder.path, task.piece) for task in tasks)
-        return maps, key_of([(task.folder.key, task.folder.is_done) for task in tasks])
+        done = [task.piece.segment in with_maps and task.folder.is_done for task in tasks]
+        maps: tuple[DenseMaps, ...] = tuple(
+            StoredMaps(task.folder.path, task.piece) if there else EmptyMaps(task.piece, longer_side=task.dense_size)
+            for task, there in zip(tasks, done, strict=True)
+        )
+        return maps, key_of([(task.folder.key, there) for task, there in zip(tasks, done, strict=True)])
 
+    def _depth_task(self, piece: SegmentPiece) -> DepthTask:
+        images = tuple(self.collection.images[i] for i in piece.images)
+        geometry = (piece.seg_from_cam, piece.intrinsics, piece.tracks)
+        key = key_of("depth", [i.digest for i in images], geometry, self.config.dense_size, self.config.depth_planes)
+        return DepthTask(
+            piece=piece,
+            images=images,
+            folder=self._segment_stage(piece.segment, f"depth_{piece.piece}", key),
+            dense_size=self.config.dense_size,
+            planes=self.config.depth_planes,
+        )
 
-def _segment_stage(run: RunDirectory, segment: int, name: str, key: str) -> StageFolder:
-    return run.stage("segments", f"{segment:04d}", name, key=key)
+    def _segment_stage(self, segment: int, name: str, key: str) -> StageFolder:
+        return self.run.stage("segments", f"{segment:04d}", name, key=key)
 
 
 def _nothing(task: MappingTask) -> MappedSegment:
@@ -276,7 +296,7 @@ def _with_failure(mapped: MappedSegment, stage: str, failure: TaskFailure) -> Ma
     return replace(mapped, attempts=(*mapped.attempts, f"{stage}: {failure.reason}"))
 
 
-def _reconstruction(mapped: MappedSegment, descriptors: npt.NDArray[np.float32]) -> SegmentReconstruction:
+def _reconstruction(mapped: MappedSegment) -> SegmentReconstruction:
     pieces = tuple(
         SegmentPiece(
             segment=mapped.segment,
@@ -287,7 +307,6 @@ def _reconstruction(mapped: MappedSegment, descriptors: npt.NDArray[np.float32])
             method=model.method,
             reprojection_error_px=model.reprojection_error_px,
             tracks=model.tracks,
-            descriptors=descriptors[list(model.images)],
         )
         for number, model in enumerate(mapped.models)
     )

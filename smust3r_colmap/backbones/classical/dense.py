@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from smust3r_colmap.backbones.classical.plane_sweep import ColourImage, reconstruct_depth
 from smust3r_colmap.importers.images import load_rgb
 from smust3r_colmap.products import SegmentPiece, SourceImage
-from smust3r_colmap.run_directory import StageFolder, key_of
+from smust3r_colmap.run_directory import StageFolder
 from smust3r_colmap.stored_maps import ImageMaps, write_maps
 
 
@@ -49,20 +47,3 @@ def make_depth(task: DepthTask) -> None:
     )
     with task.folder.write() as folder:
         write_maps(folder, (ImageMaps(depth=d.depth, confidence=d.confidence, rgb=d.rgb) for d in depths))
-
-
-def make_no_depth(task: DepthTask) -> None:
-    """Write empty maps for a piece whose sweep failed, under another key: the next start sweeps again."""
-    maps = []
-    for intrinsics in task.piece.intrinsics:
-        shrink = min(1.0, task.dense_size / max(intrinsics.width, intrinsics.height))
-        shape = (max(1, round(intrinsics.height * shrink)), max(1, round(intrinsics.width * shrink)))
-        maps.append(
-            ImageMaps(
-                depth=np.zeros(shape, np.float32),
-                confidence=np.ones(shape, np.float32),
-                rgb=np.zeros((*shape, 3), np.uint8),
-            )
-        )
-    with StageFolder(path=task.folder.path, key=key_of(task.folder.key, "no depth")).write() as folder:
-        write_maps(folder, maps)

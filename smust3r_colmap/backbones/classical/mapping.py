@@ -189,7 +189,7 @@ class _Ladder:
         if denied:
             self.largest_output = None
             if name == "incremental":
-                near = tuple(pair for pair in self.task.pairs if self._offset(pair) <= NEAR_OFFSET)
+                near = tuple(pair for pair in self.task.pairs if pair[1] - pair[0] <= NEAR_OFFSET)
                 self._build_database("near.db", near)
                 again = self._convert(self._incremental("near.db", relaxed=False), f"{name}, near pairs")
                 parts = [part for model in again for part in self._cut(model)]
@@ -279,11 +279,11 @@ class _Ladder:
         return absurd_focal(model) or diverged_focal(model, camera_of, self.task.trusted_focal)
 
     def _count_jumps(self, models: Sequence[MappedModel]) -> int:
-        return sum(len(find_jumps(model, self.task.images, self.inliers)) for model in models)
+        return sum(len(find_jumps(model, self.inliers)) for model in models)
 
     def _denied_steps(self, model: MappedModel) -> list[int]:
         with open_database(self.task.database) as database:
-            return find_denied_steps(model, self.task.images, self.inliers, database)
+            return find_denied_steps(model, self.inliers, database)
 
     def _cut(self, model: MappedModel) -> list[MappedModel]:
         """The model without denied steps and hinges: its parts between them, those that are large enough."""
@@ -293,9 +293,6 @@ class _Ladder:
         return [model] if len(bounds) == 2 else [restrict_model(model, part) for part in parts]
 
     # ------------------------------------------------------------------- plumbing
-    def _offset(self, pair: Pair) -> int:
-        return abs(self.task.images.index(pair[0]) - self.task.images.index(pair[1]))
-
     def _build_database(self, name: str, pairs: Sequence[Pair]) -> dict[Pair, int]:
         """A database of this segment alone, with the cameras to start from; inliers by pair."""
         inliers = {}

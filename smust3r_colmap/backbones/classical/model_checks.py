@@ -32,7 +32,7 @@ least; wrong ones, on a walk round a building: 0 to 0.44)."""
 MAX_EPIPOLAR_ERROR_PX = 4.0
 """COLMAP's own bound for an inlier of two views."""
 NEAR_STEPS = 2
-"""How far apart in order two images may be to deny each other; farther ones may be look-alikes."""
+"""How far apart in the sequence two images may be to deny each other; farther ones may be look-alikes."""
 MIN_HINGE_POINTS = 12
 """Common points that hold two halves of a model together (honest links: 16 at least; a wrong one: 9)."""
 MIN_FOCAL_RATIO, MAX_FOCAL_RATIO = 0.2, 8.0
@@ -67,17 +67,16 @@ def diverged_focal(model: MappedModel, camera_of: Mapping[int, int], trusted_foc
     return f"focal length {focal[k]:.0f} px, the run's is {trusted[k]:.0f} px"
 
 
-def find_jumps(model: MappedModel, order: Sequence[int], inliers: Mapping[Pair, int]) -> list[int]:
-    """Positions k where ``model.images[k]`` and its successor in ``order`` match but stand apart.
+def find_jumps(model: MappedModel, inliers: Mapping[Pair, int]) -> list[int]:
+    """Positions k where ``model.images[k]`` and the next image of the sequence match but stand apart.
 
-    A pair counts when it is consecutive in ``order`` and has STRONG_PAIR_INLIERS verified matches;
+    A pair counts when its numbers are consecutive and it has STRONG_PAIR_INLIERS verified matches;
     standing apart is a turn above MAX_TURN_DEG, or a step above MAX_STEP_RATIO median steps and
     above MIN_JUMP_DEPTHS of the distance of what the first image sees.
     """
-    place = {image: k for k, image in enumerate(order)}
     steps = []
     for k, (first, second) in enumerate(pairwise(model.images)):
-        if place[second] - place[first] == 1 and inliers.get((first, second), 0) >= STRONG_PAIR_INLIERS:
+        if second - first == 1 and inliers.get((first, second), 0) >= STRONG_PAIR_INLIERS:
             steps.append(k)
     if not steps:
         return []
@@ -116,33 +115,29 @@ def find_hinges(model: MappedModel) -> list[int]:
     return [k for k in range(len(model.images) - 1) if np.count_nonzero((first <= k) & (last > k)) < MIN_HINGE_POINTS]
 
 
-def find_denied_steps(
-    model: MappedModel, order: Sequence[int], inliers: Mapping[Pair, int], database: pycolmap.Database
-) -> list[int]:
+def find_denied_steps(model: MappedModel, inliers: Mapping[Pair, int], database: pycolmap.Database) -> list[int]:
     """Positions k such that verified matches deny how the model places image k and the next.
 
     Every pair of near images with STRONG_PAIR_INLIERS has to find most of its matches on their epipolar
     lines. That tells a fold, or a bad bridge, from a drone's half turn at the end of a strip, where the
-    model turns as well but the matches agree.
+    model turns as well but the matches agree. Images from the two ends of a loop are never near.
 
     Args:
-        order: images of the segment in order. inliers: verified matches by pair.
-        database: with the keypoints and the two-view geometries.
+        inliers: verified matches by pair. database: with the keypoints and the two-view geometries.
     """
-    place = {image: k for k, image in enumerate(order)}
     denied = set()
-    for a, b in near_positions(model.images, place):
+    for a, b in near_positions(model.images):
         strong = inliers.get((model.images[a], model.images[b]), 0) >= STRONG_PAIR_INLIERS
         if strong and explained_share(model, a, b, database) < MIN_EXPLAINED_SHARE:
             denied.add(b - 1)
     return sorted(denied)
 
 
-def near_positions(images: Sequence[int], order: Mapping[int, int]) -> Iterator[tuple[int, int]]:
-    """Positions (a, b) of images that are at most NEAR_STEPS apart in ``order``, a before b."""
+def near_positions(images: Sequence[int]) -> Iterator[tuple[int, int]]:
+    """Positions (a, b) of images that are at most NEAR_STEPS apart in the sequence, a before b."""
     for a in range(len(images)):
         for b in range(a + 1, min(a + 1 + NEAR_STEPS, len(images))):
-            if abs(order[images[b]] - order[images[a]]) <= NEAR_STEPS:
+            if images[b] - images[a] <= NEAR_STEPS:
                 yield a, b
 
 
