@@ -28,7 +28,7 @@ import logging
 import resource
 import time
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -490,7 +490,7 @@ SECTIONS: dict[str, Callable[[Room, argparse.Namespace], None]] = {
 }
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     """Run the sections and print their tables."""
     parser = argparse.ArgumentParser(description="Accuracy and cost of the alignment on a synthetic room.")
     parser.add_argument("--images", type=int, default=30, help="images shared by both segments")
@@ -500,7 +500,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20, help="how many for each cloud of points")
     parser.add_argument("--only", choices=list(SECTIONS), help="this section alone")
     parser.add_argument("--all-pixels", action="store_true", help="give the paper's Huber every pixel, as the peer")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     logging.getLogger("smust3r_colmap").setLevel(logging.ERROR)  # fallbacks are counted in the tables
     room = walk_through_room(arguments.images, arguments.height, arguments.width)
     print(

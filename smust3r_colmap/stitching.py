@@ -88,7 +88,7 @@ def stitch(
     solution = optimise(graph, world_from_node, kernel=kernel)
     for k in solution.rejected_loops:
         number = believed[k]
-        sigmas = np.sqrt(solution.loop_distances[k] / group.DOF)
+        sigmas = np.sqrt(solution.loop_distances[k] / (solution.information_scale * group.DOF))
         reason = f"the other edges of the graph contradict it by {sigmas:.1f} standard deviations"
         verdicts[number] = replace(verdicts[number], accepted=False, reason=reason)
     kept = {_piece(one) for one in verdicts if one.accepted}

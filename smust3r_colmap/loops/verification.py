@@ -12,6 +12,9 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from itertools import pairwise
+from operator import matmul
 
 import numpy as np
 
@@ -96,43 +99,44 @@ def verify_loops(
 def _verify(
     loop: PlannedLoop, pieces: Sequence[SegmentPiece], alignments: Sequence[SegmentAlignment], chain: _Chain
 ) -> LoopVerdict:
-    own = [k for k, piece in enumerate(pieces) if piece.segment == loop.segment.index]
-    if not own:
-        return LoopVerdict(piece=None, accepted=False, reason="nothing came out of the loop segment")
     ends = [set(run) for run in consecutive_runs(loop.segment.images)]
+    own = [k for k, piece in enumerate(pieces) if piece.segment == loop.segment.index]
     held = {k: [len(end & set(pieces[k].images)) for end in ends] for k in own}
+    if not own or max(min(counts) for counts in held.values()) < MIN_END_IMAGES:
+        return LoopVerdict(piece=None, accepted=False, reason=_why_no_piece(list(held.values())))
     best = max(own, key=lambda k: (min(held[k]), sum(held[k])))
-    if min(held[best]) < MIN_END_IMAGES:
-        counts = ", ".join(" + ".join(map(str, held[k])) for k in own)
-        return LoopVerdict(
-            piece=None,
-            accepted=False,
-            reason=f"no piece of the loop segment holds {MIN_END_IMAGES} images of both ends (pieces of {counts})",
-        )
     sides = [_best_edge(best, end, pieces, alignments) for end in ends]
-    missing = [loop_end for loop_end, side in zip(("first", "second"), sides, strict=True) if side is None]
-    if missing:
-        tried = [edge.reason for edge in alignments if best in (edge.target, edge.source) and edge.reason]
-        reason = f"no sound edge between the loop segment and a window of the {' and the '.join(missing)} end"
-        return LoopVerdict(piece=best, accepted=False, reason="; ".join([reason, *tried[:2]]))
     edges = tuple(side for side in sides if side is not None)
+    if len(edges) < len(ends):
+        return LoopVerdict(piece=best, accepted=False, reason=_why_no_edge(best, sides, alignments))
     first, second = (alignments[edge] for edge in edges)
+    sigmas, reason = np.nan, ""
     if first.target == second.target:
-        return LoopVerdict(piece=best, accepted=False, reason=f"window {pieces[first.target].name} holds both ends")
-    if not chain.connects(first.target, second.target):
-        return LoopVerdict(piece=best, accepted=True, edges=edges)
-    through_loop = _of_edge(first) @ _of_edge(second).inverse()
-    sigmas = chain.transform(first.target, second.target).sigmas_from(through_loop)
-    if sigmas > MAX_CLOSURE_SIGMAS:
-        return LoopVerdict(
-            piece=best,
-            accepted=False,
-            edges=edges,
-            reason=f"it contradicts the chain of windows by {sigmas:.1f} standard deviations, "
-            f"at most {MAX_CLOSURE_SIGMAS:.0f}",
-            closure_sigmas=sigmas,
-        )
-    return LoopVerdict(piece=best, accepted=True, edges=edges, closure_sigmas=sigmas)
+        reason = f"window {pieces[first.target].name} holds both ends"
+    elif chain.connects(first.target, second.target):
+        through_loop = _of_edge(first) @ _of_edge(second).inverse()
+        sigmas = chain.transform(first.target, second.target).sigmas_from(through_loop)
+        if sigmas > MAX_CLOSURE_SIGMAS:
+            reason = (
+                f"it contradicts the chain of windows by {sigmas:.1f} standard deviations, "
+                f"at most {MAX_CLOSURE_SIGMAS:.0f}"
+            )
+    return LoopVerdict(piece=best, accepted=not reason, edges=edges, reason=reason, closure_sigmas=sigmas)
+
+
+def _why_no_piece(held: Sequence[Sequence[int]]) -> str:
+    """What is wrong with pieces that hold so many images of each end."""
+    if not held:
+        return "nothing came out of the loop segment"
+    counts = ", ".join(" + ".join(map(str, one)) for one in held)
+    return f"no piece of the loop segment holds {MIN_END_IMAGES} images of both ends (pieces of {counts})"
+
+
+def _why_no_edge(loop_piece: int, sides: Sequence[int | None], alignments: Sequence[SegmentAlignment]) -> str:
+    missing = [end for end, side in zip(("first", "second"), sides, strict=True) if side is None]
+    tried = [edge.reason for edge in alignments if edge.source == loop_piece and edge.reason]
+    reason = f"no sound edge between the loop segment and a window of the {' and the '.join(missing)} end"
+    return "; ".join([reason, *tried[:2]])
 
 
 def _best_edge(
@@ -187,7 +191,5 @@ class _Chain:
         while way[-1] != a:
             way.append(before[way[-1]])
         way.reverse()
-        found = self._steps[way[0]][way[1]]
-        for node, following in zip(way[1:-1], way[2:], strict=True):
-            found = found @ self._steps[node][following]
-        return found
+        steps = [self._steps[node][following] for node, following in pairwise(way)]
+        return reduce(matmul, steps)

@@ -1,0 +1,1 @@
+"""Segments joined by measured transforms, solved together: start with ``optimise``, on a ``graph.PoseGraph``."""
