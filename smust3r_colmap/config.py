@@ -62,7 +62,7 @@ class ClassicalConfig:
     match_neighbours: int = 8
     """Every image is matched to this many next images in order."""
     exhaustive_below: int = 25
-    """Segments of at most this many images are matched exhaustively (unordered collections)."""
+    """Windows of at most this many images are matched exhaustively (unordered collections)."""
     dense_size: int = 384
     """Longer side of the depth maps."""
     depth_planes: int = 64
@@ -97,7 +97,8 @@ class LoopConfig:
     """Look for loops and close them."""
     loop_similarity: float = 0.0
     """Cosine similarity from which two images may show one place (the paper's sigma, 0.95 there for MUSt3R);
-    0 takes it from the collection: four robust standard deviations above images that are far apart."""
+    0 takes it from the collection: four robust standard deviations above images that are far apart, two
+    for the best few."""
     loop_min_candidates: int = 3
     """Image pairs that two segments must have before a loop between them is tried (the paper's k_min)."""
     loop_min_distance: int = 3
@@ -105,8 +106,8 @@ class LoopConfig:
     loop_half_width: int = 10
     """Images before and after each end of a loop that form the loop segment, inside their segments."""
     loop_kernel: LoopKernel = "cauchy"
-    """What keeps a false loop from bending the graph: cauchy, gnc (graduated non-convexity: slower, rejects
-    outright), or none as in the paper."""
+    """What keeps a false loop from bending the graph: cauchy and gnc reject the loops that the rest
+    contradicts, and cauchy also gives less weight to those that fit less well; none believes all."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.loop_similarity < 1:

@@ -9,7 +9,7 @@
     fuse          every image once, one cloud                fusion
     export        COLMAP, PLY, GLB, TUM                      exporters
 
-Every section leaves a finished stage in the run directory, so that a second start goes on.
+Every section that takes long leaves a finished stage in the run directory, so that a second start goes on.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from smust3r_colmap.backbones.classical.backbone import ClassicalBackbone
 from smust3r_colmap.chaining import ChainedPart
 from smust3r_colmap.config import RunConfig
 from smust3r_colmap.config_file import config_to_toml
-from smust3r_colmap.errors import ReconstructionError
+from smust3r_colmap.errors import DegenerateAlignmentError, ReconstructionError
 from smust3r_colmap.execution import usable_cores
 from smust3r_colmap.exporters.aside import replace_file
 from smust3r_colmap.exporters.colmap_sparse import MODEL_FILES, refuse_names_text_cannot_hold, write_colmap_sparse
@@ -101,7 +101,7 @@ def reconstruct(
         edges = _align(result, segments, config, run, clock)
         stitching = _stitch(result, edges, plan, config, run, clock)
         scenes = _fuse(result, segments, stitching.parts, collection, config, run, clock)
-        unclosed = _without_loops(result, segments, stitching, collection)
+        unclosed = _without_loops(result, segments, stitching, collection, clock)
         _export(scenes, unclosed, config, run, clock)
         summary = _summarise(collection, segments, plan, result, edges, stitching, scenes, run, clock)
         write_json(run.root / "summary.json", summary.to_json_dict())
@@ -320,13 +320,24 @@ def _without_repeats(scenes: tuple[Scene, ...]) -> tuple[Scene, ...]:
 
 
 def _without_loops(
-    result: BackboneResult, segments: tuple[Segment, ...], stitching: Stitching, collection: ImageCollection
+    result: BackboneResult,
+    segments: tuple[Segment, ...],
+    stitching: Stitching,
+    collection: ImageCollection,
+    clock: StageClock,
 ) -> Scene | None:
-    """The cameras of the largest part as the chain alone puts them, to compare with; None where no loop was closed."""
+    """The cameras of the largest part as the chain alone puts them, to compare with.
+
+    None where no loop was closed, or where the chain alone, in SL(4), sends a camera beyond infinity.
+    """
     if not any(verdict.accepted for verdict in stitching.verdicts):
         return None
     part = max(stitching.chained, key=lambda part: len({i for p in part.pieces for i in result.pieces[p].images}))
-    placed = _placed_pieces(part, result, segments)
+    try:
+        placed = _placed_pieces(part, result, segments)
+    except DegenerateAlignmentError as error:
+        clock.note(f"no trajectory without loops: {error}")
+        return None
     return _scene(placed, fusion.fuse_cameras(placed), EMPTY_CLOUD, result, collection)
 
 
@@ -363,7 +374,8 @@ def _summarise(
     clock: StageClock,
 ) -> RunSummary:
     placed = {image for scene in scenes for image in scene.image_indices}
-    why = {left.image: left.reason for one in result.reconstructions for left in one.unregistered}
+    # Windows come first and have the last word.
+    why = {left.image: left.reason for one in reversed(result.reconstructions) for left in one.unregistered}
     no_features = {one.name: one.reason for one in result.rejected}
     return RunSummary(
         output=run.root,

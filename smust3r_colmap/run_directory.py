@@ -10,7 +10,7 @@
         import/            what was read of each file
         features/          database.db: keypoints, descriptors, matches, ids = index + 1
         descriptors/       one vector per image
-        loops/             every candidate for a loop and what became of it, the loop segments
+        loops/             every candidate for a loop, why it was taken or not, the loop segments
         segments/0000/     mapping/  calibrated/  depth_0/  depth_1/ ...
         alignment/         edges between the pieces
         scene/             the fused models, before they are exported

@@ -91,6 +91,10 @@ def stitch(
         sigmas = np.sqrt(solution.loop_distances[k] / (solution.information_scale * group.DOF))
         reason = f"the other edges of the graph contradict it by {sigmas:.1f} standard deviations"
         verdicts[number] = replace(verdicts[number], accepted=False, reason=reason)
+    if solution.stop_reason != "nothing to do":
+        for number in _left_open(start, verdicts, world_from_node, solution, node_of):
+            reason = f"the pose graph kept the chain of windows: {solution.stop_reason}"
+            verdicts[number] = replace(verdicts[number], accepted=False, reason=reason)
     kept = {_piece(one) for one in verdicts if one.accepted}
     parts = tuple(
         _placed(part, solution.world_from_node, node_of)
@@ -112,6 +116,23 @@ def stitch(
 def _piece(verdict: LoopVerdict) -> int:
     assert verdict.piece is not None, "an accepted loop has a piece"
     return verdict.piece
+
+
+def _left_open(
+    start: Sequence[ChainedPart],
+    verdicts: Sequence[LoopVerdict],
+    world_from_node: Transform,
+    solution: GraphSolution,
+    node_of: Mapping[int, int],
+) -> list[int]:
+    """Believed loops of parts that no step improved, unless nothing else holds their windows together."""
+    moved = (solution.world_from_node.matrix != world_from_node.matrix).any(axis=(-1, -2))
+    at_rest = {piece for part in start if not moved[[node_of[p] for p in part.pieces]].any() for piece in part.pieces}
+    return [
+        number
+        for number, one in enumerate(verdicts)
+        if one.accepted and one.piece in at_rest and np.isfinite(one.closure_sigmas)
+    ]
 
 
 def _graph(
@@ -163,8 +184,8 @@ def closure_gap(
     """Where the window of the second end puts its cameras, against where the loop puts them.
 
     The loop piece hangs on the window of the first end by their edge; its cameras of the second end
-    are compared with those of the other window. NaN where the loop has no edges, or where nothing
-    connects the two windows.
+    are compared with those of the other window. NaN where the loop has no edges, where nothing
+    connects the two windows, and as a distance where the cameras have no extent.
     """
     if not verdict.edges:
         return UNKNOWN_GAP
@@ -178,8 +199,9 @@ def closure_gap(
             by_loop = world_from_loop.move_cameras(loop_piece.seg_from_cam[_places(loop_piece, shared)])
             by_window = frames[second.target].move_cameras(window.seg_from_cam[_places(window, shared)])
             distances = np.linalg.norm(by_loop[:, :, 3] - by_window[:, :, 3], axis=1)
+            extent = _extent(part, pieces)
             return ClosureGap(
-                distance=float(np.median(distances)) / _extent(part, pieces),
+                distance=float(np.median(distances)) / extent if extent > 0 else np.nan,
                 turn_deg=float(np.median(_angles_deg(by_loop[:, :, :3], by_window[:, :, :3]))),
             )
     return UNKNOWN_GAP

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scenes import make_piece, points_ahead, rotation_about_y, some_sim3, walk
 
-from smust3r_colmap.alignment.edges import Edges, align_pieces, candidate_pairs
+from smust3r_colmap.alignment.edges import Edges, align_pieces, candidate_pairs, disagreement_sigmas
 from smust3r_colmap.alignment.from_tracks import point_depths
 from smust3r_colmap.config import AlignmentConfig, AlignmentEdges, TransformGroup
+from smust3r_colmap.geometry.affine3 import Affine3
 from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.products import FeatureLinks, SegmentPiece
@@ -195,3 +196,13 @@ def test_all_edges_of_a_run_are_in_its_group(group: TransformGroup) -> None:
         assert type(edge.estimate.b_from_a) is GROUPS[group]
         assert edge.information.shape == (GROUPS[group].DOF,) * 2
         np.testing.assert_allclose(edge.estimate.b_from_a.matrix, turned.inverse().matrix, rtol=1e-5, atol=1e-5)
+
+
+def test_edges_a_stretched_half_turn_apart_deny_each_other() -> None:
+    a, b, _ = two_pieces(range(12), range(6, 18))
+    settings = AlignmentConfig(transform_group="affine3", alignment_edges="points")
+    (edge,) = align_pieces([a, b], [], None, settings, seed=0, advance=Counter()).alignments
+    half_turn = Affine3.from_matrix(np.diag([-1.1, -0.9, 1.0, 1.0]))
+    turned = replace(edge, estimate=replace(edge.estimate, b_from_a=edge.estimate.b_from_a @ half_turn))
+    assert disagreement_sigmas(edge, edge) == pytest.approx(0.0, abs=1e-6)
+    assert disagreement_sigmas(edge, turned) == np.inf

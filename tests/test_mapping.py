@@ -335,7 +335,9 @@ def test_a_focal_length_of_nonsense_is_refused_with_its_number() -> None:
 
 
 def test_a_camera_seen_by_one_model_only_is_left_to_it() -> None:
-    assert agree_on_cameras([read_only_segment(0, model_of_walk(6))], [0] * 6, [CAMERA]) == {}
+    alone = [read_only_segment(0, model_of_walk(6))]
+    assert agree_on_cameras(alone, [0] * 6, [CAMERA]) == {}
+    assert agree_on_cameras(alone, [0] * 6, [CAMERA], min_models=1) == {0: CAMERA}
 
 
 def test_adjusting_to_the_agreed_camera_fixes_it_exactly(

@@ -2,17 +2,34 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scenes import CAMERA, rotation_about_y, some_sim3
 
+from smust3r_colmap import pipeline, stitching
+from smust3r_colmap.backbones.base import BackboneResult
+from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.geometry.affine3 import Affine3
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.loops.planning import PlannedLoop
-from smust3r_colmap.loops.verification import UncertainTransform
-from smust3r_colmap.products import Segment, SegmentAlignment, SegmentPiece, TransformEstimate
-from smust3r_colmap.stitching import ClosureGap, Stitching, stitch
+from smust3r_colmap.loops.verification import LoopVerdict, UncertainTransform, covariance_of
+from smust3r_colmap.pose_graph.graph import PoseGraph
+from smust3r_colmap.pose_graph.optimise import GraphSolution, optimise
+from smust3r_colmap.products import (
+    ImageCollection,
+    Segment,
+    SegmentAlignment,
+    SegmentPiece,
+    SegmentReconstruction,
+    TransformEstimate,
+)
+from smust3r_colmap.progress import QuietReporter
+from smust3r_colmap.stage_clock import StageClock
+from smust3r_colmap.stitching import ClosureGap, Stitching, closure_gap, stitch
+from smust3r_colmap.stored_maps import EmptyMaps
 
 NUM_IMAGES, LENGTH, STEP = 96, 16, 8
 SIGMA = np.array([0.02, 0.02, 0.02, 0.01, 0.01, 0.01, 0.01])
@@ -206,6 +223,21 @@ def test_a_loop_joins_parts_that_the_sequence_does_not() -> None:
     assert ring.error(found, closed=True) < 0.5
 
 
+def test_a_loop_that_the_graph_could_not_use_is_not_called_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stuck(graph: PoseGraph, world_from_node: Sim3, *, kernel: str) -> GraphSolution:
+        solution = optimise(graph, world_from_node, kernel="none")
+        return replace(solution, world_from_node=world_from_node, improved=False, stop_reason="stuck")
+
+    monkeypatch.setattr(stitching, "optimise", stuck)
+    ring = Ring(0)
+    ring.add_loop(0, 10)
+    found = ring.stitched()
+    (verdict,) = found.verdicts
+    assert not verdict.accepted
+    assert verdict.reason == "the pose graph kept the chain of windows: stuck"
+    assert found.parts[0].pieces == tuple(range(11))
+
+
 def test_without_loops_the_chain_stays_as_it_is() -> None:
     ring = Ring(5)
     found = ring.stitched()
@@ -244,3 +276,64 @@ def test_uncertainties_are_carried_through_products_and_inverses_as_samples_are(
     expected = np.cov(deviations, rowvar=False)
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     np.testing.assert_allclose(found.covariance / scale, expected / scale, atol=0.04)
+
+
+def test_a_stretched_half_turn_without_logarithm_is_infinitely_far() -> None:
+    covariance = 1e-4 * np.eye(12)
+    here = UncertainTransform(b_from_a=Affine3.identity(), covariance=covariance)
+    half_turn = Affine3.from_matrix(np.diag([-1.1, -0.9, 1.0, 1.0]))
+    assert here.sigmas_from(UncertainTransform(b_from_a=half_turn, covariance=covariance)) == np.inf
+
+
+def test_a_direction_that_no_measurement_knows_denies_nothing() -> None:
+    known = np.array([4e6, 1.0, 1.0, 1e4, 1e4, 1e4, 0.0])
+    covariance = covariance_of(np.diag(known))
+    np.testing.assert_allclose(np.diag(covariance)[:6], 1 / known[:6], rtol=1e-9)
+    measured = UncertainTransform(b_from_a=Sim3.identity(), covariance=covariance)
+    three_times = replace(measured, b_from_a=Sim3.exp([0, 0, 0, 0, 0, 0, np.log(3.0)]))
+    shifted = replace(measured, b_from_a=Sim3.exp([0.01, 0, 0, 0, 0, 0, 0]))
+    assert measured.sigmas_from(three_times) < 0.01
+    assert measured.sigmas_from(shifted) == pytest.approx(20 / np.sqrt(2 * 7), rel=1e-6)
+
+
+def test_a_loop_whose_scale_nothing_knows_is_not_refused_for_its_scale() -> None:
+    ring = Ring(8)
+    ring.add_loop(0, 10, wrong=Sim3.exp([0, 0, 0, 0, 0, 0, np.log(3.0)]))
+    for position in (-1, -2):
+        edge = ring.edges[position]
+        carry = ring.seg_from_world[edge.source].inverse().adjoint()
+        unscaled = carry.T @ np.diag([*1 / SIGMA[:6] ** 2, 0]) @ carry
+        ring.edges[position] = replace(edge, information=unscaled)
+    assert ring.stitched().verdicts[0].closure_sigmas < 2.5
+
+
+def test_the_gap_of_a_camera_that_only_turns_has_no_distance() -> None:
+    ring = Ring(9)
+    ring.add_loop(0, 10)
+    pieces = [replace(piece, seg_from_cam=piece.seg_from_cam * [1, 1, 1, 0]) for piece in ring.pieces]
+    same = [replace(edge.estimate, b_from_a=Sim3.identity()) for edge in ring.edges]
+    edges = [replace(edge, estimate=estimate) for edge, estimate in zip(ring.edges, same, strict=True)]
+    (part,) = stitch(pieces[:-1], edges[:-2], [], group=Sim3, kernel="none").chained
+    verdict = LoopVerdict(piece=11, accepted=True, edges=(10, 11))
+    assert np.isnan(closure_gap(verdict, pieces, edges, [part]).distance)
+
+
+def test_a_chain_that_cannot_be_drawn_costs_the_comparison_and_not_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    ring = Ring(0)
+    ring.add_loop(0, 10)
+    found = ring.stitched()
+    assert found.verdicts[0].accepted
+    reconstructions = tuple(
+        SegmentReconstruction(segment=piece.segment, pieces=(piece,), unregistered=(), attempts=(), metric=False)
+        for piece in ring.pieces
+    )
+    maps = tuple(EmptyMaps(piece, longer_side=8) for piece in ring.pieces)
+    result = BackboneResult(reconstructions=reconstructions, dense=maps, dense_key="", links=None, rejected=())
+
+    def beyond_infinity(*_: object) -> None:
+        raise DegenerateAlignmentError("2 of 16 cameras lie beyond the plane that the transform sends to infinity")
+
+    monkeypatch.setattr(pipeline, "_placed_pieces", beyond_infinity)
+    clock = StageClock(QuietReporter(sys.stderr))
+    collection = ImageCollection(images=(), cameras=())
+    assert pipeline._without_loops(result, (), found, collection, clock) is None

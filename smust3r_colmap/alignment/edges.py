@@ -338,8 +338,14 @@ def _denied_by(edge: SegmentAlignment, beside: Sequence[SegmentAlignment | Tried
 
 
 def disagreement_sigmas(first: SegmentAlignment, second: SegmentAlignment) -> float:
-    """How far apart two edges between the same pieces are, per degree of freedom, in standard deviations."""
-    difference = (first.estimate.b_from_a.inverse() @ second.estimate.b_from_a).log()
+    """How far apart two edges between the same pieces are, per degree of freedom, in standard deviations.
+
+    Infinite where the difference is a stretched half turn, which has no logarithm.
+    """
+    between = first.estimate.b_from_a.inverse() @ second.estimate.b_from_a
+    if not between.log_exists():
+        return float("inf")
+    difference = between.log()
     # The inverse of the sum of both covariances, also where one of them says nothing about a direction.
     both = first.information @ np.linalg.pinv(first.information + second.information) @ second.information
     return float(np.sqrt(difference @ both @ difference / len(difference)))

@@ -28,6 +28,8 @@ MIN_END_IMAGES = 3
 MAX_CLOSURE_SIGMAS = 5.0
 """Between the way through the loop and the chain, per degree of freedom. The covariances are good to a
 factor of two or three, so this refuses what is absurd and leaves the rest to the graph."""
+NOTHING_KNOWN = 1e-12
+"""Information, of rows of unit size, with which every direction is taken to be known at least."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,8 +74,15 @@ class UncertainTransform:
         return UncertainTransform(b_from_a=self.b_from_a.inverse(), covariance=carry @ self.covariance @ carry.T)
 
     def sigmas_from(self, other: UncertainTransform) -> float:
-        """Root of the squared Mahalanobis distance per degree of freedom."""
-        difference = (self.b_from_a.inverse() @ other.b_from_a).log()
+        """Root of the squared Mahalanobis distance per degree of freedom.
+
+        Infinite where the difference is a stretched half turn, which has no logarithm: no two
+        measurements of one place differ by that.
+        """
+        between = self.b_from_a.inverse() @ other.b_from_a
+        if not between.log_exists():
+            return float("inf")
+        difference = between.log()
         squared = difference @ np.linalg.solve(self.covariance + other.covariance, difference)
         return float(np.sqrt(squared / len(difference)))
 
@@ -156,8 +165,19 @@ def _best_edge(
 
 
 def _of_edge(edge: SegmentAlignment) -> UncertainTransform:
-    covariance = np.linalg.pinv(edge.information).astype(np.float64)
-    return UncertainTransform(b_from_a=edge.estimate.b_from_a, covariance=covariance)
+    return UncertainTransform(b_from_a=edge.estimate.b_from_a, covariance=covariance_of(edge.information))
+
+
+def covariance_of(information: FloatArray) -> FloatArray:
+    """(d, d) inverse of an information matrix; what it leaves open gets a very large variance.
+
+    A pseudo-inverse would give it none at all. Rows are brought to like size first, for a tangent
+    vector mixes lengths, angles and their inverses.
+    """
+    size = np.sqrt(np.diag(information))
+    units = np.outer(*2 * [np.where(size > 0, size, 1.0)])
+    covariance: FloatArray = np.linalg.inv(information / units + NOTHING_KNOWN * np.eye(len(size))) / units
+    return covariance
 
 
 class _Chain:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from smust3r_colmap.backbones.base import BackboneResult
 from smust3r_colmap.backbones.classical.calibration import CalibrationTask, agree_on_cameras, calibrate_segment
 from smust3r_colmap.backbones.classical.dense import DepthTask, make_depth
-from smust3r_colmap.backbones.classical.descriptors import vlad_descriptors
+from smust3r_colmap.backbones.classical.descriptors import FEATURES_PER_IMAGE, vlad_descriptors
 from smust3r_colmap.backbones.classical.features import (
     Pair,
     create_database,
@@ -98,7 +98,10 @@ class ClassicalBackbone:
         if not stage.is_done:
             with open_database(features.database) as opened:
                 numbers = range(1, len(self.collection) + 1)
-                sift = [np.asarray(opened.read_descriptors(number).data).reshape(-1, 128) for number in numbers]
+                sift = [  # copies, for a slice would hold on to all features of the image
+                    np.asarray(opened.read_descriptors(number).data).reshape(-1, 128)[:FEATURES_PER_IMAGE].copy()
+                    for number in numbers
+                ]
             made = vlad_descriptors(sift, rng=np.random.default_rng(self.seed))
             with stage.write() as folder:
                 write_arrays(folder / "descriptors.safetensors", {"vlad": made})
@@ -147,8 +150,10 @@ class ClassicalBackbone:
     def _match(self, segments: Sequence[Segment]) -> dict[int, tuple[Pair, ...]]:
         """The matched pairs by segment. Pairs that failed are in no key, so what comes later is not final either."""
         usable = self._features.usable
+        descriptors = self.describe() if any(segment.kind == "loop" for segment in segments) else None
         plan = {
-            segment.index: [(a, b) for a, b in self._pairs(segment) if usable[a] and usable[b]] for segment in segments
+            segment.index: [(a, b) for a, b in self._pairs(segment, descriptors) if usable[a] and usable[b]]
+            for segment in segments
         }
         every_pair = {pair for pairs in plan.values() for pair in pairs}
         with self.reporter.stage("matching", total=len(every_pair)) as stage:
@@ -162,10 +167,11 @@ class ClassicalBackbone:
             )
         return {index: tuple(pair for pair in pairs if pair in matched) for index, pairs in plan.items()}
 
-    def _pairs(self, segment: Segment) -> tuple[Pair, ...]:
+    def _pairs(self, segment: Segment, descriptors: npt.NDArray[np.float32] | None) -> tuple[Pair, ...]:
         neighbours = self.config.match_neighbours
         if segment.kind == "loop":
-            return plan_loop_pairs(segment, self.describe(), neighbours=neighbours)
+            assert descriptors is not None, "loops are found by descriptors"
+            return plan_loop_pairs(segment, descriptors, neighbours=neighbours)
         return plan_pairs(segment, neighbours=neighbours, exhaustive_below=self.config.exhaustive_below)
 
     # --------------------------------------------------------------- every segment
@@ -189,17 +195,21 @@ class ClassicalBackbone:
             for k, one in zip(crashed, again, strict=True):
                 mapped[k] = one
         windows = [one for one, segment in zip(mapped, segments, strict=True) if segment.kind == "window"]
-        agreed = agree_on_cameras(windows, [image.camera for image in self.collection.images], self.collection.cameras)
+        camera_of_image = [image.camera for image in self.collection.images]
+        agreed = agree_on_cameras(windows, camera_of_image, self.collection.cameras)
+        # What one window alone has seen is agreed as far as that window goes, not for the loops that meet it.
+        agreed_for_loops = agree_on_cameras(windows, camera_of_image, self.collection.cameras, min_models=1)
+        cameras = [agreed_for_loops if segment.kind == "loop" else agreed for segment in segments]
         for camera, intrinsics in agreed.items():
             self.reporter.note(
                 f"camera {camera + 1}: the segments agree on a focal length of {intrinsics.focal_px:.1f} px"
             )
         chosen = [k for k, one in enumerate(mapped) if one.models]
-        keys = [key_of("calibrated", keys[k], sorted(agreed.items())) for k in chosen]
+        keys = [key_of("calibrated", keys[k], sorted(cameras[k].items())) for k in chosen]
         folders = [
             self._segment_stage(mapped[k].segment, "calibrated", key) for k, key in zip(chosen, keys, strict=True)
         ]
-        calibrations = [CalibrationTask(mapping=tasks[k], mapped=mapped[k], agreed=agreed) for k in chosen]
+        calibrations = [CalibrationTask(mapping=tasks[k], mapped=mapped[k], agreed=cameras[k]) for k in chosen]
         with self.reporter.stage("calibration", total=len(chosen)) as stage:
             calibrated = self._finish(calibrate_segment, calibrations, folders, [mapped[k] for k in chosen], stage)
         for k, one in zip(chosen, calibrated, strict=True):

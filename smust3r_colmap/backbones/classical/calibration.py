@@ -46,13 +46,17 @@ class CalibrationTask:
 
 
 def agree_on_cameras(
-    segments: Sequence[MappedSegment], camera_of_image: Sequence[int], priors: Sequence[Intrinsics]
+    segments: Sequence[MappedSegment],
+    camera_of_image: Sequence[int],
+    priors: Sequence[Intrinsics],
+    *,
+    min_models: int = 2,
 ) -> dict[int, Intrinsics]:
     """Weighted median of each parameter over the models, by camera index.
 
     A model counts as many times as it has images of the camera and observations per image allow:
-    weight is images of the camera times the square root of its points. Cameras that only one model
-    has seen are agreed by definition and left out.
+    weight is images of the camera times the square root of its points. Cameras that fewer than
+    ``min_models`` models have seen are left out: one model alone agrees with itself.
     """
     params: dict[int, list[tuple[float, tuple[float, ...]]]] = {}
     for segment in segments:
@@ -64,7 +68,7 @@ def agree_on_cameras(
                 params.setdefault(camera, []).append((weight, intrinsics.params))
     agreed = {}
     for camera, seen in params.items():
-        if len(seen) < 2:
+        if len(seen) < min_models:
             continue
         weights = np.array([weight for weight, _ in seen])
         values = np.array([value for _, value in seen])

@@ -15,7 +15,8 @@ from scipy.cluster.vq import kmeans2, vq
 
 NUM_CENTRES = 64
 _TRAINING_FEATURES = 50_000
-_FEATURES_PER_IMAGE = 1_000
+FEATURES_PER_IMAGE = 1_000
+"""Features of an image that count; 128 bytes each are held for all images at once."""
 
 
 def vlad_descriptors(sift: Sequence[npt.NDArray[np.uint8]], *, rng: np.random.Generator) -> npt.NDArray[np.float32]:
@@ -25,15 +26,17 @@ def vlad_descriptors(sift: Sequence[npt.NDArray[np.uint8]], *, rng: np.random.Ge
         sift: (K_i, 128) uint8 per image, already root-normalised by COLMAP; the first thousand are used.
         rng: chooses the training sample and the first centres.
     """
-    features = [np.asarray(one[:_FEATURES_PER_IMAGE], dtype=np.float32) for one in sift]
-    stacked = np.concatenate([*features, np.zeros((0, 128), np.float32)])
+    features = [one[:FEATURES_PER_IMAGE] for one in sift]
+    stacked = np.concatenate([*features, np.zeros((0, 128), np.uint8)])
     out = np.zeros((len(features), NUM_CENTRES, 128), np.float32)
     if len(stacked) < NUM_CENTRES:
         return out.reshape(len(features), -1)
     sample = rng.choice(len(stacked), size=min(len(stacked), _TRAINING_FEATURES), replace=False)
-    vocabulary, _ = kmeans2(stacked[np.sort(sample)], NUM_CENTRES, iter=10, minit="points", rng=rng)
-    for image, own in enumerate(features):
-        if len(own):
+    training = stacked[np.sort(sample)].astype(np.float32)
+    vocabulary, _ = kmeans2(training, NUM_CENTRES, iter=10, minit="points", rng=rng)
+    for image, few in enumerate(features):
+        if len(few):
+            own = few.astype(np.float32)
             word, _ = vq(own, vocabulary)
             np.add.at(out[image], word, own - vocabulary[word])
     out /= np.maximum(np.linalg.norm(out, axis=2, keepdims=True), 1e-9)
