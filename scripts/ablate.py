@@ -15,7 +15,8 @@ from a set with depth, and figures are means over seeds. With the classical back
 is a whole run; those of one segment length share a run directory, and so features and mapping.
 
 APE is the root mean square distance of camera centres after a Sim(3) fit, AAE the mean angle between
-orientations, both of the largest model (``smust3r_colmap.evaluation``).
+orientations, both of the largest model (``smust3r_colmap.evaluation``); "of the chain" is the spanning tree of
+the windows before the pose graph, which by itself weighs both edges of every pair.
 """
 
 from __future__ import annotations
@@ -471,8 +472,8 @@ def columns(question: str, unit: str) -> tuple[Column, ...]:
         Column(name="AAE deg", cell=_number("aae_deg")),
     )
     without = (
-        Column(name=f"APE {unit} without loops", cell=_number("ape_before")),
-        Column(name="AAE deg without loops", cell=_number("aae_before_deg")),
+        Column(name=f"APE {unit} of the chain", cell=_number("ape_before")),
+        Column(name="AAE deg of the chain", cell=_number("aae_before_deg")),
     )
     of_group = (
         Column(name="fallbacks", cell=_number("fallbacks")),
