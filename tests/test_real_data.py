@@ -99,3 +99,24 @@ def test_photographs_of_many_cameras_get_a_camera_each(data_dir: Callable[[str],
     sizes = {image.name: (camera.width, camera.height) for image in model.images.values() if (camera := image.camera)}
     assert len(set(sizes.values())) > 1
     assert np.isfinite([camera.params[0] for camera in model.cameras.values()]).all()
+
+
+def test_the_loop_round_a_courtyard_is_found_and_closed(data_dir: Callable[[str], Path], tmp_path: Path) -> None:
+    """The last photographs of castle_p30 show again what the first ones show."""
+    folder = data_dir("castle_p30")
+    names = sorted(path.name for path in (folder / "images").iterdir())
+    config = replace(
+        CONFIG,
+        segmentation=SegmentationConfig(segment_length=12, overlap=6),
+        classical=replace(CONFIG.classical, max_image_size=800, dense_size=128),
+    )
+    summary, found = run(folder, names, tmp_path, config)
+    (loop,) = summary.loops
+    assert loop.accepted, loop.reason
+    assert loop.gap_after_percent < 0.6 * loop.gap_before_percent
+    truth = read_poses_txt(folder / "poses.txt")
+    ends = [truth[name] for name in (loop.image_a, loop.image_b)]
+    assert np.linalg.norm(ends[0][:, 3] - ends[1][:, 3]) < 0.1 * found.extent
+    assert np.degrees(np.arccos(ends[0][:, 2] @ ends[1][:, 2])) < 40
+    assert summary.num_registered == found.num_compared == 30
+    assert found.position_rmse_percent < 2.0
