@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.geometry.so3 import angles_between
 from smust3r_colmap.products import (
     DenseMaps,
     FloatArray,
@@ -100,10 +101,7 @@ class _Sightings:
         """(K, K) distances of the centres and (K, K) angles in degrees between the rotations."""
         centres, rotations = self.world_from_cam[:, :, 3], self.world_from_cam[:, :, :3]
         distances = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
-        # |R_a - R_b|_F = 2 sqrt(2) sin(angle / 2), exact also for tiny angles, unlike the trace.
-        chord = np.linalg.norm(rotations[:, None] - rotations[None], axis=(-2, -1))
-        angles_deg = np.rad2deg(2 * np.arcsin(np.minimum(chord / np.sqrt(8), 1)))
-        return distances, angles_deg
+        return distances, np.rad2deg(angles_between(rotations[:, None], rotations[None]))
 
 
 def fuse_cameras(pieces: Sequence[PlacedPiece]) -> FusedCameras:

@@ -15,12 +15,13 @@ import numpy as np
 
 from smust3r_colmap.chaining import ChainedPart, chain_pieces
 from smust3r_colmap.config import LoopKernel
+from smust3r_colmap.geometry.so3 import angles_between
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.loops.planning import PlannedLoop
 from smust3r_colmap.loops.verification import LoopVerdict, verify_loops
 from smust3r_colmap.pose_graph.graph import TRUSTED, PoseGraph
 from smust3r_colmap.pose_graph.optimise import GraphSolution, optimise
-from smust3r_colmap.products import FloatArray, SegmentAlignment, SegmentPiece
+from smust3r_colmap.products import SegmentAlignment, SegmentPiece
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,7 +203,7 @@ def closure_gap(
             extent = _extent(part, pieces)
             return ClosureGap(
                 distance=float(np.median(distances)) / extent if extent > 0 else np.nan,
-                turn_deg=float(np.median(_angles_deg(by_loop[:, :, :3], by_window[:, :, :3]))),
+                turn_deg=float(np.degrees(np.median(angles_between(by_loop[:, :, :3], by_window[:, :, :3])))),
             )
     return UNKNOWN_GAP
 
@@ -218,10 +219,3 @@ def _extent(part: ChainedPart, pieces: Sequence[SegmentPiece]) -> float:
         for piece, frame in zip(part.pieces, part.world_from_seg, strict=True)
     ]
     return float(np.linalg.norm(np.ptp(np.concatenate(centres), axis=0)))
-
-
-def _angles_deg(rotations_a: FloatArray, rotations_b: FloatArray) -> FloatArray:
-    """(N,) angles between rotations (N, 3, 3)."""
-    chord = np.linalg.norm(rotations_a - rotations_b, axis=(-2, -1))
-    angles: FloatArray = np.degrees(2 * np.arcsin(np.minimum(chord / np.sqrt(8), 1)))
-    return angles

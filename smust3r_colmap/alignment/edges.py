@@ -25,6 +25,7 @@ from smust3r_colmap.alignment.uncertainty import honest_information, overlap_cen
 from smust3r_colmap.config import AlignmentConfig
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.geometry.groups import GROUPS, embed
+from smust3r_colmap.geometry.so3 import angles_between
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import (
     DenseMaps,
@@ -357,6 +358,4 @@ def camera_turn_deg(a: SegmentPiece, b: SegmentPiece, fit: PieceFit) -> float:
     poses_a = a.seg_from_cam[[a.images.index(image) for image in shared]]
     poses_b = b.seg_from_cam[[b.images.index(image) for image in shared]]
     moved = fit.estimate.b_from_a.move_cameras(poses_b)
-    relative = np.swapaxes(poses_a[..., :3], -1, -2) @ moved[..., :3]
-    cosine = (np.trace(relative, axis1=-2, axis2=-1) - 1) / 2
-    return float(np.median(np.degrees(np.arccos(np.clip(cosine, -1, 1)))))
+    return float(np.degrees(np.median(angles_between(poses_a[..., :3], moved[..., :3]))))

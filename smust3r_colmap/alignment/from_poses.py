@@ -26,7 +26,7 @@ from smust3r_colmap.config import RobustKernel
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3
-from smust3r_colmap.geometry.so3 import skew
+from smust3r_colmap.geometry.so3 import angles_between, skew
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import FloatArray, SegmentPiece, TransformEstimate
 
@@ -140,7 +140,7 @@ class _Cameras:
     def residuals(self, fit: Sim3) -> tuple[FloatArray, FloatArray]:
         """(N,) distances of the centres over the depth and (N,) angles in radians."""
         distances = np.linalg.norm(self.centres_b - fit.apply(self.centres_a), axis=1)
-        return distances, _angles(self.rotations_b, fit.rotation @ self.rotations_a)
+        return distances, angles_between(self.rotations_b, fit.rotation @ self.rotations_a)
 
     def uncentred(self, fit: Sim3) -> Sim3:
         """The same transform between the frames of the caller."""
@@ -162,13 +162,6 @@ def _shared_cameras(target: SegmentPiece, source: SegmentPiece, depth: float) ->
         mean_b=mean_b,
         depth=depth,
     )
-
-
-def _angles(rotations: FloatArray, others: FloatArray) -> FloatArray:
-    """(...) angles between rotations (..., 3, 3), exact also for tiny ones."""
-    chord = np.linalg.norm(rotations - others, axis=(-2, -1))  # 2 sqrt(2) sin(angle / 2)
-    angles: FloatArray = 2 * np.arcsin(np.minimum(chord / np.sqrt(8), 1))
-    return angles
 
 
 # -------------------------------------------------------------------------------- solver
@@ -250,7 +243,7 @@ def _start(pairs: _Cameras, *, fixed_scale: bool) -> Sim3:
 
 def _median_rotation(rotations: FloatArray) -> FloatArray:
     """The one of (N, 3, 3) whose angles to all others have the least sum; half of them may be wrong."""
-    total = _angles(rotations[:, None], rotations[None]).sum(axis=1)
+    total = angles_between(rotations[:, None], rotations[None]).sum(axis=1)
     median: FloatArray = rotations[int(np.argmin(total))]
     return median
 
@@ -263,7 +256,7 @@ def _reweighted(pairs: _Cameras, fit: Sim3, kernel: RobustKernel, *, fixed_scale
         terms = _terms(pairs, fit, kernel, sigmas)
         before, fit = fit, _closed_form(pairs, fit, terms, fixed_scale=fixed_scale)
         moved = np.linalg.norm(fit.apply(pairs.centres_a) - before.apply(pairs.centres_a), axis=1).max()
-        turned = float(_angles(fit.rotation, before.rotation))
+        turned = float(angles_between(fit.rotation, before.rotation))
         if max(moved / terms.centre_sigma, turned / terms.rotation_sigma) <= CONVERGED_MOTION:
             return fit, iteration, "converged"
     return fit, REDESCENDING_ITERATIONS, "iteration limit"

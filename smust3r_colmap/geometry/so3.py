@@ -34,6 +34,13 @@ def unskew(matrix: FloatArray) -> FloatArray:
     return np.stack([turn[..., 2, 1], turn[..., 0, 2], turn[..., 1, 0]], axis=-1)
 
 
+def angles_between(rotations: FloatArray, others: FloatArray) -> FloatArray:
+    """(...) angles in radians between rotations (..., 3, 3), exact also for tiny ones, unlike by the trace."""
+    chord = np.linalg.norm(rotations - others, axis=(-2, -1))  # 2 sqrt(2) sin(angle / 2)
+    angles: FloatArray = 2 * np.arcsin(np.minimum(chord / np.sqrt(8), 1))
+    return angles
+
+
 def angle_and_axis(rotvec: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Angles (...,) in radians and unit axes (..., 3) of rotation vectors; the axis is zero where the angle is."""
     angle = np.linalg.norm(rotvec, axis=-1)
