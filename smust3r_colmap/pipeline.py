@@ -174,7 +174,8 @@ def _refuse_nothing(result: BackboneResult, collection: ImageCollection) -> None
     attempts = [f"segment {one.segment}: {'; '.join(one.attempts)}" for one in result.reconstructions]
     raise ReconstructionError(
         f"none of the {len(result.reconstructions)} segments ({len(collection)} images) could be reconstructed. "
-        f"{'. '.join(attempts[:3])}. Do the images overlap, and are neighbours in name order neighbours in space?"
+        f"{'. '.join(attempts[:3])}. Do the images overlap, did the camera move, and are neighbours in name order "
+        "neighbours in space?"
     )
 
 
