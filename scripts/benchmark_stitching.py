@@ -59,17 +59,8 @@ class Ring:
 
     def without_wrong(self) -> PoseGraph:
         """The graph of the true loops."""
-        graph = self.graph
-        keep = ~np.isin(graph.loop, self.wrong)
-        _, loop = np.unique(np.concatenate([[-1], graph.loop[keep]]), return_inverse=True)
-        return replace(
-            graph,
-            target=graph.target[keep],
-            source=graph.source[keep],
-            target_from_source=graph.target_from_source[keep],
-            information=graph.information[keep],
-            loop=loop[1:] - 1,
-        )
+        true = np.flatnonzero(~np.isin(self.graph.loop, self.wrong))
+        return self.graph.with_edges(true)[0]
 
 
 Errors = Callable[[np.random.Generator, int], FloatArray]

@@ -33,8 +33,8 @@ EXIT_FAILED = 1
 EXIT_WRONG_USE = 2
 EXIT_INTERRUPTED = 130
 
-# Position error of the demo, in percent of the path's extent, above which something is broken;
-# without loop closure the segments drift by about one percent.
+# Position error of the demo, in percent of the path's extent, above which something is broken; a
+# tenth of a percent is usual.
 _DEMO_WEAK_PERCENT = 5.0
 
 # The demo's walls are covered with texture; a quarter of the features does, in a third of the time.

@@ -8,6 +8,8 @@ from typing import get_args
 import numpy as np
 import numpy.typing as npt
 import pytest
+from room_overlap import ROOM_M, TURN, Overlap, room_overlap
+from room_overlap import SIMILARITY as SOURCE_FROM_TARGET
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.alignment.from_pointmaps import align_pointmaps
@@ -26,51 +28,6 @@ from smust3r_colmap.products import FeatureLinks, SegmentPiece, Tracks, Transfor
 FloatArray = npt.NDArray[np.float64]
 KERNELS: tuple[RobustKernel, ...] = get_args(RobustKernel)
 REDESCENDING: tuple[RobustKernel, ...] = ("cauchy", "tukey")
-ROOM_M = np.array([6.0, 3.0, 4.0])
-TURN = Rotation.from_rotvec(np.deg2rad(35) * np.array([0.6, 0.64, 0.48])).as_matrix()
-SOURCE_FROM_TARGET = Sim3(scale=np.array(1.7), rotation=TURN, translation=np.array([1.0, -2.0, 3.0]))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Overlap:
-    """Points of a room seen from inside by two segments with depth noise; see `room_overlap`."""
-
-    points_source: FloatArray
-    points_target: FloatArray
-    depth_source: FloatArray
-    depth_target: FloatArray
-    exact_source: FloatArray
-    exact_target: FloatArray
-
-    @property
-    def ones(self) -> FloatArray:
-        return np.ones(len(self.points_source))
-
-    def map_cm(self, target_from_source: Transform) -> float:
-        """Mean distance of the exact points from where they belong."""
-        apart = target_from_source.apply(self.exact_source) - self.exact_target
-        return 100 * float(np.linalg.norm(apart, axis=1).mean())
-
-
-def room_overlap(count: int, outliers: float, *, noise: float = 0.01, seed: int = 0) -> Overlap:
-    """The target has one-sided outliers, 30 to 100 % too deep; both sides have depth noise."""
-    rng = np.random.default_rng(seed)
-    centres = ROOM_M / 2 + rng.uniform(-0.5, 0.5, (count, 3)) * [3.0, 0.5, 1.0]
-    rays = rng.normal(size=(count, 3))
-    rays /= np.linalg.norm(rays, axis=1)[:, None]
-    depth = ((np.where(rays > 0, ROOM_M, 0.0) - centres) / rays).min(axis=1)
-    factor = np.where(rng.random(count) < outliers, rng.uniform(1.3, 2.0, count), 1.0)
-    depth_target = depth * factor * (1 + noise * rng.standard_normal(count))
-    depth_source = depth * (1 + noise * rng.standard_normal(count))
-    exact = centres + depth[:, None] * rays
-    return Overlap(
-        points_source=SOURCE_FROM_TARGET.apply(centres + depth_source[:, None] * rays),
-        points_target=centres + depth_target[:, None] * rays,
-        depth_source=1.7 * depth_source,
-        depth_target=depth_target,
-        exact_source=SOURCE_FROM_TARGET.apply(exact),
-        exact_target=exact,
-    )
 
 
 def assert_close(one: Transform, other: Transform, tolerance: float) -> None:
@@ -112,7 +69,7 @@ def test_exact_points_with_outliers_give_the_transform_to_rounding(kernel: Robus
 def test_sim3_survives_30_percent_one_sided_outliers_except_with_huber(
     kernel: RobustKernel, lowest_cm: float, highest_cm: float
 ) -> None:
-    data = room_overlap(10_000, 0.3)
+    data = room_overlap(SOURCE_FROM_TARGET, count=10_000, outliers=0.3)
     fit = align_room(data, kernel)
     assert lowest_cm < data.map_cm(fit) < highest_cm
 
@@ -132,7 +89,7 @@ def align_room(data: Overlap, kernel: RobustKernel) -> Sim3:
 
 @pytest.mark.parametrize("kernel", REDESCENDING)
 def test_robust_start_survives_45_percent_where_the_plain_start_is_lost(kernel: RobustKernel) -> None:
-    data = room_overlap(10_000, 0.45)
+    data = room_overlap(SOURCE_FROM_TARGET, count=10_000, outliers=0.45)
     plain = estimate_sim3(data.points_source, data.points_target, data.ones, kernel=kernel)
     assert data.map_cm(plain.b_from_a) > 20
     assert data.map_cm(align_room(data, kernel)) < 0.3
@@ -141,7 +98,7 @@ def test_robust_start_survives_45_percent_where_the_plain_start_is_lost(kernel: 
 @pytest.mark.parametrize("kernel", REDESCENDING)
 @pytest.mark.parametrize("unit", [0.1, 100.0])
 def test_unit_of_the_scene_does_not_matter(kernel: RobustKernel, unit: float) -> None:
-    data = room_overlap(3000, 0.3)
+    data = room_overlap(SOURCE_FROM_TARGET, count=3000, outliers=0.3)
     scaled = replace(
         data,
         points_source=unit * data.points_source,
@@ -156,7 +113,7 @@ def test_unit_of_the_scene_does_not_matter(kernel: RobustKernel, unit: float) ->
 
 
 def test_unit_of_the_scene_does_matter_to_huber() -> None:
-    data = room_overlap(3000, 0.3)
+    data = room_overlap(SOURCE_FROM_TARGET, count=3000, outliers=0.3)
     small = sim3_of(estimate_sim3(0.1 * data.points_source, 0.1 * data.points_target, data.ones, kernel="huber"))
     metre = estimate_sim3(data.points_source, data.points_target, data.ones, kernel="huber").b_from_a
     assert data.map_cm(replace(small, translation=10 * small.translation)) > 3 * data.map_cm(metre)
@@ -164,7 +121,7 @@ def test_unit_of_the_scene_does_matter_to_huber() -> None:
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_place_of_the_scene_does_not_matter(kernel: RobustKernel) -> None:
-    data = room_overlap(3000, 0.3)
+    data = room_overlap(SOURCE_FROM_TARGET, count=3000, outliers=0.3)
     far = Sim3(scale=np.array(1.0), rotation=np.eye(3), translation=np.array([1000.0, -1000.0, 1000.0]))
     moved = replace(data, points_source=far.apply(data.points_source), points_target=far.apply(data.points_target))
     assert_close(far.inverse() @ align_room(moved, kernel) @ far, align_room(data, kernel), 1e-8)
@@ -172,7 +129,7 @@ def test_place_of_the_scene_does_not_matter(kernel: RobustKernel) -> None:
 
 @pytest.mark.parametrize("kernel", REDESCENDING)
 def test_swapping_the_sides_gives_the_inverse(kernel: RobustKernel) -> None:
-    data = room_overlap(5000, 0.2)
+    data = room_overlap(SOURCE_FROM_TARGET, count=5000, outliers=0.2)
     swapped = replace(
         data,
         points_source=data.points_target,
@@ -186,7 +143,15 @@ def test_swapping_the_sides_gives_the_inverse(kernel: RobustKernel) -> None:
 def test_scale_does_not_shrink_with_the_noise() -> None:
     # A least-squares (Umeyama) scale is 0.09 % too small here, at every edge of a chain.
     logs = [
-        np.log(1.7 * float(align_room(room_overlap(4000, 0.0, noise=0.03, seed=k), "cauchy").scale)) for k in range(20)
+        np.log(
+            1.7
+            * float(
+                align_room(
+                    room_overlap(SOURCE_FROM_TARGET, count=4000, outliers=0.0, noise=0.03, seed=k), "cauchy"
+                ).scale
+            )
+        )
+        for k in range(20)
     ]
     assert abs(np.mean(logs)) < 4e-4
     assert 2e-4 < np.std(logs) < 2e-3
@@ -225,7 +190,7 @@ def test_fixed_scale_keeps_one_and_finds_the_rigid_motion() -> None:
 
 
 def test_rows_without_weight_or_value_have_no_influence() -> None:
-    data = room_overlap(400, 0.0)
+    data = room_overlap(SOURCE_FROM_TARGET, count=400, outliers=0.0)
     clean = estimate_sim3(data.points_source, data.points_target, data.ones)
     points = np.vstack([data.points_source, np.array([[np.nan, 0, 0], [1, 2, 3], [9, 9, 9]])])
     targets = np.vstack([data.points_target, np.array([[0, 0, 0], [np.inf, 0, 0], [-90, 9, 9]])])
@@ -239,7 +204,7 @@ def test_rows_without_weight_or_value_have_no_influence() -> None:
 
 
 def test_weight_of_two_is_two_rows() -> None:
-    data = room_overlap(300, 0.2)
+    data = room_overlap(SOURCE_FROM_TARGET, count=300, outliers=0.2)
     weights = np.random.default_rng(3).integers(1, 4, 300)
     weighted = estimate_sim3(data.points_source, data.points_target, weights)
     repeated = estimate_sim3(
@@ -253,7 +218,7 @@ def test_weight_of_two_is_two_rows() -> None:
 
 
 def test_evidence_reports_noise_and_inliers() -> None:
-    data = room_overlap(10_000, 0.3)
+    data = room_overlap(SOURCE_FROM_TARGET, count=10_000, outliers=0.3)
     estimate = estimate_sim3(data.points_source, data.points_target, data.ones, residual_scale=data.depth_source / 1.7)
     assert 0.013 < estimate.residual_sigma < 0.0155  # sqrt(2) times 1 %
     assert 0.012 < estimate.rms < 0.0155

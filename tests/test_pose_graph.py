@@ -88,21 +88,8 @@ def measured_ring(
     return world, graph, chained(graph.target_from_source[steps]), wrong
 
 
-def chosen_edges(graph: PoseGraph, edges: IntArray) -> PoseGraph:
-    """Some of the edges; their loops are renumbered in order."""
-    _, loop = np.unique(np.concatenate([[-1], graph.loop[edges]]), return_inverse=True)
-    return replace(
-        graph,
-        target=graph.target[edges],
-        source=graph.source[edges],
-        target_from_source=graph.target_from_source[edges],
-        information=graph.information[edges],
-        loop=loop[1:] - 1,
-    )
-
-
 def without_loops(graph: PoseGraph, loops: IntArray) -> PoseGraph:
-    return chosen_edges(graph, np.flatnonzero(~np.isin(graph.loop, loops)))
+    return graph.with_edges(np.flatnonzero(~np.isin(graph.loop, loops)))[0]
 
 
 def joined(*graphs: PoseGraph) -> PoseGraph:
@@ -204,7 +191,7 @@ def test_normal_equations_equal_dense_ones() -> None:
 
 def test_contracted_graph_has_the_minimum_of_the_whole() -> None:
     _, graph, start, _ = measured_ring(61, 3)
-    graph = joined(graph, chosen_edges(graph, np.arange(60)))  # two edges per neighbours
+    graph = joined(graph, graph.with_edges(np.arange(60))[0])  # two edges per neighbours
     held = np.arange(61) == 0
     whole = levenberg_marquardt(graph, start, held, quadratic(np.ones(3)), max_iterations=50, relative_decrease=1e-12)
     small = contract(graph, whole.world_from_node, held)
@@ -504,7 +491,7 @@ def test_contradictory_sequence_edges_meet_in_the_middle() -> None:
 def test_a_loop_that_alone_joins_two_parts_is_believed() -> None:
     _, graph, start, _ = measured_ring(20, 1)
     last = graph.target[-1]  # of the part before the cut, where the loop begins
-    cut = chosen_edges(graph, np.flatnonzero((graph.target != last) | (graph.loop >= 0)))
+    cut = graph.with_edges(np.flatnonzero((graph.target != last) | (graph.loop >= 0)))[0]
     assert (cut.components() == 0).all() and len(cut) == 19
     begin = start.matrix
     begin[last + 1 :] = Sim3.exp(np.full(7, 0.3)).matrix @ begin[last + 1 :]

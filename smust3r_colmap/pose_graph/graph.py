@@ -6,7 +6,7 @@ together, because a false loop is false in every one of them. The next module to
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -101,23 +101,27 @@ class PoseGraph:
         labels: IntArray = connected_components(joins, directed=False)[1].astype(np.int64)
         return labels
 
+    def with_edges(self, edges: IntArray) -> tuple[PoseGraph, IntArray]:
+        """The same nodes and some of the edges; the loops that are left, by their numbers here, are renumbered."""
+        loops, loop = np.unique(self.loop[edges], return_inverse=True)
+        if len(loops) and loops[0] == TRUSTED:
+            loops, loop = loops[1:], loop - 1
+        graph = replace(
+            self,
+            target=self.target[edges],
+            source=self.source[edges],
+            target_from_source=self.target_from_source[edges],
+            information=self.information[edges],
+            loop=loop,
+        )
+        return graph, loops
+
     def subgraph(self, nodes: IntArray) -> tuple[PoseGraph, IntArray]:
         """The graph of some nodes (ascending, any edge with both ends among them), and its loops' numbers here."""
         new = np.full(self.num_nodes, -1, dtype=np.int64)
         new[nodes] = np.arange(len(nodes))
-        keep = np.flatnonzero((new[self.target] >= 0) & (new[self.source] >= 0))
-        loops, loop = np.unique(self.loop[keep], return_inverse=True)
-        if len(loops) and loops[0] == TRUSTED:
-            loops, loop = loops[1:], loop - 1
-        graph = PoseGraph(
-            num_nodes=len(nodes),
-            target=new[self.target[keep]],
-            source=new[self.source[keep]],
-            target_from_source=self.target_from_source[keep],
-            information=self.information[keep],
-            loop=loop,
-        )
-        return graph, loops
+        graph, loops = self.with_edges(np.flatnonzero((new[self.target] >= 0) & (new[self.source] >= 0)))
+        return replace(graph, num_nodes=len(nodes), target=new[graph.target], source=new[graph.source]), loops
 
 
 def loop_sums(values: FloatArray, loop: IntArray, num_loops: int) -> FloatArray:
