@@ -14,7 +14,7 @@ from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.pose_graph.contract import contract
-from smust3r_colmap.pose_graph.graph import PoseGraph
+from smust3r_colmap.pose_graph.graph import TRUSTED, PoseGraph
 from smust3r_colmap.pose_graph.levenberg import levenberg_marquardt, quadratic
 from smust3r_colmap.pose_graph.linearise import (
     NormalEquations,
@@ -557,6 +557,17 @@ def test_singular_information_leaves_the_rest_to_the_others() -> None:
     found = optimise(joined(graph, replace(graph, information=blind)), start)
     assert found.improved and len(found.rejected_loops) == 0
     assert ate(world, found.world_from_node) < 0.5 * ate(world, start)
+
+
+def test_chosen_edges_keep_their_loops_under_new_numbers() -> None:
+    _, graph, _, _ = measured_ring(20, 5)
+    chain = np.flatnonzero(graph.loop == TRUSTED)
+    some, loops = graph.with_edges(np.concatenate([chain, np.flatnonzero(np.isin(graph.loop, [1, 4]))]))
+    assert (some.num_nodes, some.num_loops, loops.tolist()) == (20, 2, [1, 4])
+    assert some.loop[len(chain) :].tolist() == [0, 1]
+    np.testing.assert_array_equal(some.target[-1], graph.target[np.flatnonzero(graph.loop == 4)[0]])
+    only_loops, loops = graph.with_edges(np.flatnonzero(graph.loop >= 3))
+    assert (only_loops.loop.tolist(), loops.tolist()) == ([0, 1], [3, 4])
 
 
 # ---------------------------------------------------------------------------- refusals
