@@ -1,4 +1,4 @@
-"""The command line: ``reconstruct``, ``demo`` and ``doctor``.
+"""The command line: ``reconstruct``, ``demo`` and ``doctor``; ``weights`` is in ``weights_command``.
 
 Flags, files and exit codes live here and nowhere else; so do printing and the set-up of logging.
 Settings come from the defaults, then the TOML file, then the flags. What a command needs is
@@ -28,6 +28,7 @@ from smust3r_colmap.config_file import flags_from_settings, read_settings
 from smust3r_colmap.errors import ConfigError, InputError, SmustrError
 from smust3r_colmap.progress import Reporter, reporter_for
 from smust3r_colmap.summary import EXIT_GOOD, EXIT_WEAK, RunSummary
+from smust3r_colmap.weights_command import WeightsAction, WeightsCommand, run_weights
 
 EXIT_FAILED = 1
 EXIT_WRONG_USE = 2
@@ -89,7 +90,7 @@ class Doctor:
     """Print the traceback of an unexpected error."""
 
 
-Command = Reconstruct | Demo | Doctor
+Command = Reconstruct | Demo | Doctor | WeightsCommand
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -155,6 +156,8 @@ def _run(command: Command) -> int:
         return _run_reconstruct(command)
     if isinstance(command, Demo):
         return _run_demo(command)
+    if isinstance(command, WeightsAction):
+        return _run_weights(command)
     return _run_doctor(command)
 
 
@@ -210,6 +213,11 @@ def _tell(summary: RunSummary, reporter: Reporter, *, quiet: bool) -> None:
         return
     for reason in summary.weak_reasons:
         reporter.warn(reason)
+
+
+def _run_weights(action: WeightsAction) -> int:
+    with _reporting(quiet=action.quiet, verbose=action.verbose) as reporter:
+        return run_weights(action, reporter)
 
 
 def _run_doctor(command: Doctor) -> int:

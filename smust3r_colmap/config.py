@@ -13,7 +13,10 @@ from typing import Literal
 from smust3r_colmap.errors import ConfigError
 
 CameraMode = Literal["auto", "single", "per-folder", "per-image"]
-BackboneName = Literal["classical"]
+KeyframeStrategy = Literal["linspace", "retrieval", "every-kth", "overlap"]
+CameraFit = Literal["robust", "upstream", "pnp"]
+Device = Literal["auto", "cpu", "cuda"]
+Precision = Literal["auto", "float32", "bfloat16"]
 TransformGroup = Literal["sim3", "se3", "affine3", "sl4"]
 AlignmentEdges = Literal["both", "points", "poses"]
 LoopKernel = Literal["cauchy", "gnc", "none"]
@@ -31,6 +34,9 @@ class ImportConfig:
     single is one for all; per-folder and per-image as named."""
     camera_model: str = "SIMPLE_RADIAL"
     """COLMAP model of cameras that come without calibration; COLMAP's own default, one distortion term."""
+    camera_params: str = ""
+    """Known intrinsics of all images: COLMAP's parameters of the camera model, separated by commas, in pixels of
+    the upright images. They are used and kept as they are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +73,53 @@ class ClassicalConfig:
     """Longer side of the depth maps."""
     depth_planes: int = 64
     """Depth hypotheses per pixel at most, uniform in inverse depth; fewer where steps of one pixel suffice."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Must3rConfig:
+    """The network backbone. Its weights have a licence of their own and never come with this package."""
+
+    weights: str = ""
+    """Checkpoint, .pth as published or .safetensors as converted; by default what SMUST3R_WEIGHTS names, then what
+    `weights fetch` put into the cache."""
+    network_size: int = 512
+    """Longer side of the images in the network; other sizes than the trained one interpolate positions."""
+    keyframes: KeyframeStrategy = "linspace"
+    """Which images of a segment the network remembers: evenly spread (linspace), unlike each other
+    (retrieval), every k-th, or where something new is seen (overlap)."""
+    max_keyframes: int = 50
+    """Images that the network remembers of a segment at most; it was trained with 20 and wears off beyond 50."""
+    keyframe_interval: int = 3
+    """k of the every-kth keyframes."""
+    keyframe_threshold: float = 0.05
+    """Of the overlap keyframes: how far from what was seen, divided by depth, counts as new."""
+    refinements: int = 0
+    """Times that all keyframes are shown again against the full memory."""
+    rerender: bool = True
+    """Predict every image against the final memory, rather than keep what was said when a keyframe was new."""
+    camera_fit: CameraFit = "robust"
+    """Cameras from pointmaps: robust (confident pixels, one focal length per camera), upstream (all pixels, as
+    published), or pnp (RANSAC by pycolmap)."""
+    device: Device = "auto"
+    """Where the network runs; auto takes a CUDA card if there is one."""
+    precision: Precision = "auto"
+    """float32 is the reference; auto takes bfloat16 where the hardware multiplies it."""
+    network_memory: float = 0.0
+    """GiB that the network may use; 0 takes most of what is free."""
+    token_cache: float = 20.0
+    """GiB of disk for encoded images, so that none is encoded twice; 3 MiB each at 512 x 384."""
+    retrieval_weights: str = ""
+    """Trained retrieval head for descriptors; by default they are the mean of the encoder's tokens."""
+
+    def __post_init__(self) -> None:
+        if self.network_size < 32 or self.network_size % 16:
+            raise ConfigError(f"--network-size {self.network_size}: a multiple of 16, 32 or more")
+        for name, least in (("max_keyframes", 1), ("keyframe_interval", 1), ("refinements", 0)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"--{name.replace('_', '-')} {getattr(self, name)}: must be at least {least}")
+        for name in ("keyframe_threshold", "network_memory", "token_cache"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"--{name.replace('_', '-')} {getattr(self, name)}: must not be negative")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,9 +194,13 @@ class RunConfig:
 
     importing: ImportConfig = field(default_factory=ImportConfig)
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
-    backbone: BackboneName = "classical"
-    """What reconstructs a segment; classical needs no weights."""
+    backbone: str = "classical"
+    """What reconstructs a segment: classical needs no weights, must3r does, and other packages may add more
+    (`doctor` lists them)."""
+    backbone_options: str = ""
+    """Settings of a backbone from another package, as name=value,name=value."""
     classical: ClassicalConfig = field(default_factory=ClassicalConfig)
+    must3r: Must3rConfig = field(default_factory=Must3rConfig)
     alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
     loop_closing: LoopConfig = field(default_factory=LoopConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)

@@ -5,11 +5,13 @@
     |   +-- ConfigError           an option, or a combination of options
     |   +-- ImageError            one image file
     |   +-- CollectionError       the set of images as a whole
+    |   +-- CheckpointError       a file of network weights
     +-- ReconstructionError       the images are fine, the geometry did not come out
     |   +-- DegenerateAlignmentError   points that do not determine a transform
     +-- RunDirectoryError         the output folder
     |   +-- RunLockedError        another process is writing to it
     |   +-- StorageError          the disk refused (full, read-only, unreadable)
+    +-- DownloadError             a file that could not be fetched
     +-- MissingDependencyError    an optional package, with what to install
 
 A message names the file or segment at fault, the number found, the number needed and the way out.
@@ -39,6 +41,10 @@ class CollectionError(InputError):
     """The set of images as a whole cannot be used."""
 
 
+class CheckpointError(InputError):
+    """A file of network weights is not what it should be."""
+
+
 class ReconstructionError(SmustrError):
     """The images were read, but no geometry came out."""
 
@@ -57,6 +63,10 @@ class RunLockedError(RunDirectoryError):
 
 class StorageError(RunDirectoryError):
     """The disk refused a read or a write."""
+
+
+class DownloadError(SmustrError):
+    """A file could not be fetched; what has come so far is kept."""
 
 
 class MissingDependencyError(SmustrError):
