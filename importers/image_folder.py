@@ -16,7 +16,7 @@ import unicodedata
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from statistics import median
@@ -306,6 +306,8 @@ def collection_from_scan(scan: FolderScan, config: ImportConfig) -> ImageCollect
     _check_enough(scan, usable, rejected)
     groups = _camera_groups(usable, config.camera_mode)
     cameras = [_shared_prior([usable[index].photo for index in members], config.camera_model) for members in groups]
+    if config.camera_params:
+        cameras = _known_cameras(cameras, config)
     camera_of = {index: camera for camera, members in enumerate(groups) for index in members}
     images = tuple(
         SourceImage(
@@ -319,7 +321,9 @@ def collection_from_scan(scan: FolderScan, config: ImportConfig) -> ImageCollect
         for index, image in enumerate(usable)
     )
     logger.info("%s: %d images, %d cameras, %d left out", scan.folder, len(images), len(cameras), len(rejected))
-    return ImageCollection(images=images, cameras=tuple(cameras), rejected=tuple(rejected))
+    return ImageCollection(
+        images=images, cameras=tuple(cameras), rejected=tuple(rejected), calibrated=bool(config.camera_params)
+    )
 
 
 def _without_name_twins(records: Sequence[ImportRecord]) -> tuple[list[_Usable], list[RejectedImage]]:
@@ -409,6 +413,31 @@ def _shared_prior(photos: Sequence[Photo], camera_model: str) -> Intrinsics:
     camera = pycolmap.Camera.create_from_model_name(1, camera_model, focal, width, height)
     camera.has_prior_focal_length = bool(priors)
     return Intrinsics.from_colmap(camera)
+
+
+def _known_cameras(cameras: Sequence[Intrinsics], config: ImportConfig) -> list[Intrinsics]:
+    """The calibration that was given, for every camera.
+
+    Raises:
+        ConfigError: it is no list of numbers, has the wrong count, or the images have more than one size.
+    """
+    given, model = f"--camera-params {config.camera_params}", config.camera_model
+    sizes = sorted({(camera.width, camera.height) for camera in cameras})
+    if len(sizes) > 1:
+        shown = ", ".join(f"{width}x{height}" for width, height in sizes[:4])
+        raise ConfigError(f"{given}: holds for one image size, the images have {len(sizes)} ({shown})")
+    try:
+        params = tuple(float(number) for number in config.camera_params.split(","))
+    except ValueError:
+        raise ConfigError(f"{given}: needed are numbers separated by commas") from None
+    needed = pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1).params_info
+    try:
+        known = replace(cameras[0], model=model, params=params, has_prior_focal=True)
+    except ValueError as error:
+        raise ConfigError(f"{given}: does not fit --camera-model {model}, which takes {needed} ({error})") from None
+    if known.focal_px <= 0:
+        raise ConfigError(f"{given}: the focal length is {known.focal_px:g} px")
+    return [known] * len(cameras)
 
 
 def _check_camera_model(name: str) -> None:

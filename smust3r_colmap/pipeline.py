@@ -19,12 +19,12 @@ from pathlib import Path
 
 from smust3r_colmap import fusion
 from smust3r_colmap.alignment.edges import Edges, align_pieces, candidate_pairs, needs_maps
-from smust3r_colmap.backbones.base import Backbone, BackboneResult
-from smust3r_colmap.backbones.classical.backbone import ClassicalBackbone
+from smust3r_colmap.backbones.base import Backbone, BackboneContext, BackboneResult
+from smust3r_colmap.backbones.registry import make_backbone, read_options
 from smust3r_colmap.chaining import ChainedPart
 from smust3r_colmap.config import RunConfig
 from smust3r_colmap.config_file import config_to_toml
-from smust3r_colmap.errors import DegenerateAlignmentError, ReconstructionError
+from smust3r_colmap.errors import ConfigError, DegenerateAlignmentError, ReconstructionError
 from smust3r_colmap.execution import usable_cores
 from smust3r_colmap.exporters.aside import replace_file
 from smust3r_colmap.exporters.colmap_sparse import MODEL_FILES, refuse_names_text_cannot_hold, write_colmap_sparse
@@ -129,8 +129,19 @@ def _import(images: Path, config: RunConfig, run: RunDirectory, clock: StageCloc
 
 
 def _backbone(collection: ImageCollection, config: RunConfig, run: RunDirectory, clock: StageClock) -> Backbone:
-    workers = config.workers or usable_cores()
-    return ClassicalBackbone(collection, config.classical, run, clock, workers=workers, seed=config.seed)
+    backbone = make_backbone(
+        BackboneContext(
+            collection=collection,
+            config=config,
+            options=read_options(config.backbone_options),
+            run=run,
+            reporter=clock,
+            workers=config.workers or usable_cores(),
+        )
+    )
+    if config.alignment.alignment_source == "tracks" and not backbone.has_tracks:
+        raise ConfigError(f"--alignment-source tracks: the backbone {backbone.name} has no tracks; take pointmaps")
+    return backbone
 
 
 def _find_loops(
@@ -293,6 +304,8 @@ def _scene(
     collection: ImageCollection,
 ) -> Scene:
     intrinsics = fusion.fuse_intrinsics(placed, [image.camera for image in collection.images])
+    if collection.calibrated:
+        intrinsics = {camera: collection.cameras[camera] for camera in intrinsics}
     metric = all(result.reconstructions[one.piece.segment].metric for one in placed)
     return fusion.build_scene(collection, placed, cameras, intrinsics, cloud, metric=metric)
 
@@ -305,7 +318,8 @@ def _scene_input(piece: SegmentPiece, world_from_seg: Transform, collection: Ima
     """What a piece puts into a scene besides its maps; the names too, for files may be renamed."""
     images = [collection.images[index] for index in piece.images]
     names = [(image.name, image.camera) for image in images]
-    geometry = (piece.seg_from_cam, piece.intrinsics, piece.tracks)
+    intrinsics = collection.cameras if collection.calibrated else piece.intrinsics
+    geometry = (piece.seg_from_cam, intrinsics, piece.tracks)
     return piece.name, type(world_from_seg).__name__, world_from_seg.matrix, piece.images, names, geometry
 
 
@@ -410,6 +424,7 @@ def _summarise(
                 num_pieces=len(one.pieces),
                 num_registered=len({image for piece in one.pieces for image in piece.images}),
                 method=one.pieces[0].method if one.pieces else "",
+                doubts=one.doubts,
             )
             for segment, one in zip(segments, result.reconstructions, strict=True)
         ),

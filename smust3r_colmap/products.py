@@ -57,6 +57,12 @@ class RejectedImage:
 class ImageCollection:
     """All images in processing order, with the prior of each camera.
 
+    Args:
+        images: the usable ones.
+        cameras: by the index that the images name; start values, unless calibrated.
+        rejected: files that were left out.
+        calibrated: the cameras are known and stay as they are.
+
     Raises:
         ValueError: two images share a name, or a camera index or size does not fit.
     """
@@ -64,6 +70,7 @@ class ImageCollection:
     images: tuple[SourceImage, ...]
     cameras: tuple[Intrinsics, ...]
     rejected: tuple[RejectedImage, ...] = ()
+    calibrated: bool = False
 
     def __post_init__(self) -> None:
         names = [image.name for image in self.images]
@@ -243,6 +250,7 @@ class SegmentReconstruction:
         unregistered: images of the segment in no piece.
         attempts: what was tried, in order, in words for people.
         metric: lengths are metres.
+        doubts: why the geometry, though kept, should not be trusted.
     """
 
     segment: int
@@ -250,6 +258,7 @@ class SegmentReconstruction:
     unregistered: tuple[UnregisteredImage, ...]
     attempts: tuple[str, ...]
     metric: bool
+    doubts: tuple[str, ...] = ()
 
 
 # -------------------------------------------------------------------------- alignment

@@ -533,6 +533,39 @@ def test_a_shared_camera_takes_the_median_of_the_priors(tmp_path: Path, mode: Ca
     assert {camera.model for camera in collection.cameras} == {"OPENCV"}
 
 
+def test_a_known_calibration_holds_for_every_camera(tmp_path: Path) -> None:
+    for index in range(3):
+        write(tmp_path / f"{index}.jpg", index, exif=exif(focal_35mm=20))
+    settings = ImportConfig(camera_mode="per-image", camera_model="OPENCV", camera_params="50, 51,30,20,.1,0,0,0")
+    collection = import_image_folder(tmp_path, settings)
+    assert collection.calibrated
+    assert {camera.params for camera in collection.cameras} == {(50, 51, 30, 20, 0.1, 0, 0, 0)}
+    assert {camera.model for camera in collection.cameras} == {"OPENCV"}
+    assert len(collection.cameras) == 3
+    assert not import_image_folder(tmp_path, AUTO).calibrated
+
+
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        ("50,30", r"--camera-params 50,30: does not fit --camera-model PINHOLE, which takes fx, fy, cx, cy"),
+        ("a,b,c,d", "--camera-params a,b,c,d: needed are numbers separated by commas"),
+        ("0,0,30,20", "--camera-params 0,0,30,20: the focal length is 0 px"),
+        ("nan,50,30,20", "--camera-params nan,50,30,20: does not fit .* not finite"),
+    ],
+)
+def test_refuses_a_calibration_that_is_none(folder: Path, params: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        import_image_folder(folder, ImportConfig(camera_model="PINHOLE", camera_params=params))
+
+
+def test_refuses_one_calibration_for_two_sizes(tmp_path: Path) -> None:
+    write(tmp_path / "a.jpg", 0)
+    write(tmp_path / "b.jpg", 1, size=(80, 60))
+    with pytest.raises(ConfigError, match=r"holds for one image size, the images have 2 \(60x40, 80x60\)"):
+        import_image_folder(tmp_path, ImportConfig(camera_params="50,30,20,0"))
+
+
 def test_per_image_gives_every_image_its_camera(folder: Path) -> None:
     collection = import_image_folder(folder, ImportConfig(camera_mode="per-image"))
     assert [image.camera for image in collection.images] == [0, 1]

@@ -20,6 +20,7 @@ from smust3r_colmap.config import (
     AlignmentConfig,
     ClassicalConfig,
     FusionConfig,
+    ImportConfig,
     LoopConfig,
     OutputConfig,
     RunConfig,
@@ -41,6 +42,9 @@ CONFIG = RunConfig(
     fusion=FusionConfig(max_points=20_000),
     output=OutputConfig(text=True),
 )
+
+
+NO_LOOPS = LoopConfig(loops=False)
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +86,17 @@ def test_the_focal_length_is_found_at_the_original_size(finished: RunSummary, ro
     assert (camera.width, camera.height) == (width, height)
     assert camera.params[0] == pytest.approx(focal, rel=0.02)
     assert tuple(camera.params[1:3]) == (width / 2, height / 2)
+
+
+def test_a_known_calibration_is_kept_to_the_last_digit(room: Path, tmp_path: Path) -> None:
+    params = (room / "intrinsics.txt").read_text().split("\n")[1].split()[2:]
+    known = ImportConfig(camera_model="PINHOLE", camera_params=",".join(params))
+    summary = run(room / "images", tmp_path / "out", replace(CONFIG, importing=known, loop_closing=NO_LOOPS))
+    (camera,) = pycolmap.Reconstruction(tmp_path / "out/sparse/0").cameras.values()
+    assert (camera.model.name, [*camera.params]) == ("PINHOLE", [float(value) for value in params])
+    poses = read_reference_sparse(tmp_path / "out/sparse/0")
+    assert summary.num_registered == NUM_IMAGES
+    assert compare_trajectories(poses, read_poses_txt(room / "poses.txt")).position_rmse < 0.02
 
 
 def test_the_model_is_read_by_an_independent_reader(finished: RunSummary) -> None:

@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.backbones.base import BackboneResult
+from smust3r_colmap.backbones.base import BackboneContext, BackboneResult
 from smust3r_colmap.backbones.classical.calibration import CalibrationTask, agree_on_cameras, calibrate_segment
 from smust3r_colmap.backbones.classical.dense import DepthTask, make_depth
 from smust3r_colmap.backbones.classical.descriptors import FEATURES_PER_IMAGE, vlad_descriptors
@@ -29,6 +29,7 @@ from smust3r_colmap.backbones.classical.mapping import MappedSegment, MappingTas
 from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
 from smust3r_colmap.config import ClassicalConfig
 from smust3r_colmap.execution import TaskFailure, map_tasks
+from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import (
     DenseMaps,
     FeatureLinks,
@@ -181,7 +182,8 @@ class ClassicalBackbone:
         Windows alone have a say about the cameras, so a loop that is found later changes no window.
         """
         tasks = [self._mapping_task(segment, pairs[segment.index]) for segment in segments]
-        keys = [key_of("mapping", self._features.key, task.images, task.pairs, self.seed) for task in tasks]
+        fixed = ("calibrated",) if self.collection.calibrated else ()
+        keys = [key_of("mapping", self._features.key, task.images, task.pairs, self.seed, *fixed) for task in tasks]
         folders = [self._segment_stage(task.segment, "mapping", key) for task, key in zip(tasks, keys, strict=True)]
         with self.reporter.stage("mapping", total=len(tasks)) as stage:
             mapped = self._finish(map_segment, tasks, folders, [_nothing(task) for task in tasks], stage)
@@ -194,16 +196,7 @@ class ClassicalBackbone:
                 )
             for k, one in zip(crashed, again, strict=True):
                 mapped[k] = one
-        windows = [one for one, segment in zip(mapped, segments, strict=True) if segment.kind == "window"]
-        camera_of_image = [image.camera for image in self.collection.images]
-        agreed = agree_on_cameras(windows, camera_of_image, self.collection.cameras)
-        # What one window alone has seen is agreed as far as that window goes, not for the loops that meet it.
-        agreed_for_loops = agree_on_cameras(windows, camera_of_image, self.collection.cameras, min_models=1)
-        cameras = [agreed_for_loops if segment.kind == "loop" else agreed for segment in segments]
-        for camera, intrinsics in agreed.items():
-            self.reporter.note(
-                f"camera {camera + 1}: the segments agree on a focal length of {intrinsics.focal_px:.1f} px"
-            )
+        cameras = self._agreed_cameras(segments, mapped)
         chosen = [k for k, one in enumerate(mapped) if one.models]
         keys = [key_of("calibrated", keys[k], sorted(cameras[k].items())) for k in chosen]
         folders = [
@@ -216,6 +209,23 @@ class ClassicalBackbone:
             mapped[k] = one
         return mapped
 
+    def _agreed_cameras(
+        self, segments: Sequence[Segment], mapped: Sequence[MappedSegment]
+    ) -> list[dict[int, Intrinsics]]:
+        """The cameras that each segment is to be brought to: known ones, else those that the windows agree on."""
+        if self.collection.calibrated:
+            return [dict(enumerate(self.collection.cameras))] * len(segments)
+        windows = [one for one, segment in zip(mapped, segments, strict=True) if segment.kind == "window"]
+        camera_of_image = [image.camera for image in self.collection.images]
+        agreed = agree_on_cameras(windows, camera_of_image, self.collection.cameras)
+        # What one window alone has seen is agreed as far as that window goes, not for the loops that meet it.
+        agreed_for_loops = agree_on_cameras(windows, camera_of_image, self.collection.cameras, min_models=1)
+        for camera, intrinsics in agreed.items():
+            self.reporter.note(
+                f"camera {camera + 1}: the segments agree on a focal length of {intrinsics.focal_px:.1f} px"
+            )
+        return [agreed_for_loops if segment.kind == "loop" else agreed for segment in segments]
+
     def _mapping_task(self, segment: Segment, pairs: tuple[Pair, ...]) -> MappingTask:
         return MappingTask(
             segment=segment.index,
@@ -226,6 +236,7 @@ class ClassicalBackbone:
             cameras=self.collection.cameras,
             trusted_focal={},
             seed=self.seed,
+            calibrated=self.collection.calibrated,
         )
 
     def _finish(
@@ -344,3 +355,15 @@ def _read_links(database: Path, pairs: Sequence[Pair]) -> FeatureLinks:
     empty = np.zeros(0, dtype=np.int64)
     joined = [np.concatenate([empty, *column]) for column in columns]
     return FeatureLinks(image_a=joined[0], feature_a=joined[1], image_b=joined[2], feature_b=joined[3])
+
+
+def make_classical(context: BackboneContext) -> ClassicalBackbone:
+    """The factory that the registry knows; it takes no options, for all its settings are in the configuration."""
+    return ClassicalBackbone(
+        context.collection,
+        context.config.classical,
+        context.run,
+        context.reporter,
+        workers=context.workers,
+        seed=context.config.seed,
+    )

@@ -61,6 +61,7 @@ class MappingTask:
         trusted_focal: the run's consensus focal length by camera index, empty in the first pass.
         seed: of pycolmap's samplers.
         use_global: the last rung may be climbed; not after it brought the process down.
+        calibrated: the cameras are known and stay as they are.
     """
 
     segment: int
@@ -72,6 +73,7 @@ class MappingTask:
     trusted_focal: Mapping[int, float]
     seed: int
     use_global: bool = True
+    calibrated: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,6 +231,8 @@ class _Ladder:
         options.ba_local_function_tolerance = 1e-6
         options.ba_global_function_tolerance = 1e-6
         options.ba_global_max_refinements = 3
+        options.ba_refine_focal_length = not self.task.calibrated
+        options.ba_refine_extra_params = not self.task.calibrated
         options.mapper.num_threads = 1
         options.mapper.random_seed = self.task.seed
         options.triangulation.random_seed = self.task.seed
@@ -263,6 +267,8 @@ class _Ladder:
         options.mapper.random_seed = self.task.seed
         options.mapper.global_positioning.use_gpu = False
         options.mapper.bundle_adjustment.ceres.use_gpu = False
+        options.mapper.bundle_adjustment.refine_focal_length = not self.task.calibrated
+        options.mapper.bundle_adjustment.refine_extra_params = not self.task.calibrated
         output = self.scratch / "global"
         output.mkdir(exist_ok=True)
         models: dict[int, pycolmap.Reconstruction] = pycolmap.global_mapping(
