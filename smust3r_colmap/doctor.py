@@ -18,6 +18,7 @@ from importlib import metadata
 from typing import Any
 
 from smust3r_colmap import __version__
+from smust3r_colmap.backbones.registry import OUR_PACKAGE, KnownBackbone, list_backbones
 from smust3r_colmap.execution import usable_cores
 
 _IMPORT_TIMEOUT_S = 120.0
@@ -35,17 +36,37 @@ _PACKAGES = (
     ("open3d", "import open3d\nif open3d.core.cuda.is_available(): print('CUDA')"),
 )
 
-# No backbone of this version loads these: they may be broken and a reconstruction still works.
+# They may be broken and a reconstruction still works: nothing loads open3d, and torch is for networks only.
 _NOT_NEEDED = frozenset({"open3d", "torch"})
 
 _PARTS = (
-    ("backbone", "classical", "smust3r_colmap.backbones.classical.backbone"),
     ("importer", "image folder", "smust3r_colmap.importers.image_folder"),
     ("exporter", "COLMAP model", "smust3r_colmap.exporters.colmap_sparse"),
     ("exporter", "PLY cloud", "smust3r_colmap.exporters.ply"),
     ("exporter", "GLB scene", "smust3r_colmap.exporters.glb"),
     ("exporter", "TUM trajectory", "smust3r_colmap.exporters.tum_trajectory"),
 )
+
+# What a child process runs to import a backbone, and what it runs besides where more is worth knowing.
+_IMPORT_BACKBONE = "from smust3r_colmap.backbones.registry import load_factory\nload_factory({name!r})\n"
+_MORE_OF_BACKBONE = {
+    "must3r": """
+from smust3r_colmap.backbones.must3r.precision import describe_precision
+from smust3r_colmap.config import Must3rConfig
+from smust3r_colmap.errors import CheckpointError
+from smust3r_colmap.weights.cache import find_weights
+for line in describe_precision():
+    print(line)
+try:
+    print(f"weights: {find_weights('', Must3rConfig().network_size)}")
+except CheckpointError as error:
+    print(error)
+""",
+    "vggt": "from smust3r_colmap.backbones.vggt import import_vggt\nimport_vggt()\n",
+}
+
+# The backbone that works without anything else; the others may be broken.
+_NEEDED_BACKBONE = "classical"
 
 # Where the name to import is not the name to install.
 _DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow"}
@@ -72,6 +93,7 @@ class Check:
         works: it can be imported.
         needed: the program cannot do its work without it.
         devices: accelerators that it can use.
+        remarks: what else is worth knowing, such as whether a network has its weights.
         advice: why it does not work and what to do; empty when it works.
     """
 
@@ -81,6 +103,7 @@ class Check:
     works: bool
     needed: bool
     devices: tuple[str, ...]
+    remarks: tuple[str, ...]
     advice: str
 
 
@@ -134,6 +157,7 @@ def examine() -> Diagnosis:
     with ThreadPoolExecutor(max_workers=2) as pool:
         checks = [
             *pool.map(_check_package, *zip(*_PACKAGES, strict=True)),
+            *pool.map(_check_backbone, list_backbones()),
             *pool.map(_check_part, *zip(*_PARTS, strict=True)),
         ]
     return Diagnosis(
@@ -148,6 +172,9 @@ def examine() -> Diagnosis:
 
 def advice_for(stderr: str) -> str:
     """Why an import failed and what to install, from what the child process wrote; its last line is the exception."""
+    ours = re.fullmatch(r"smust3r_colmap\.errors\.\w+: (.+)", (stderr.strip().splitlines() or [""])[-1])
+    if ours:
+        return ours[1]
     library = re.search(r"(lib[\w.+-]+?\.so[\w.]*): cannot open shared object file", stderr)
     if library:
         owner = next((owner for start, owner in _SYSTEM_PACKAGES.items() if library[1].startswith(start)), None)
@@ -169,13 +196,30 @@ def _check_package(distribution: str, program: str) -> Check:
         works=not advice,
         needed=distribution not in _NOT_NEEDED,
         devices=devices,
+        remarks=(),
+        advice=advice,
+    )
+
+
+def _check_backbone(known: KnownBackbone) -> Check:
+    is_ours = known.package == OUR_PACKAGE
+    program = _IMPORT_BACKBONE.format(name=known.name) + (_MORE_OF_BACKBONE.get(known.name, "") if is_ours else "")
+    remarks, advice = _run_child(program)
+    return Check(
+        kind="backbone",
+        name=known.name if is_ours else f"{known.name} (of {known.package})",
+        version="" if is_ours else _version(known.package),
+        works=not advice,
+        needed=is_ours and known.name == _NEEDED_BACKBONE,
+        devices=(),
+        remarks=remarks,
         advice=advice,
     )
 
 
 def _check_part(kind: str, name: str, module: str) -> Check:
     _, advice = _run_child(f"import {module}")
-    return Check(kind=kind, name=name, version="", works=not advice, needed=True, devices=(), advice=advice)
+    return Check(kind=kind, name=name, version="", works=not advice, needed=True, devices=(), remarks=(), advice=advice)
 
 
 def _run_child(program: str) -> tuple[tuple[str, ...], str]:
@@ -209,5 +253,5 @@ def _memory_bytes() -> int:
 
 def _check_line(check: Check) -> str:
     state = "works" if check.works else ("BROKEN" if check.needed else "not usable, not needed")
-    advice = f": {check.advice}" if check.advice else ""
-    return f"  {check.kind:8}  {f'{check.name} {check.version}'.strip():32}  {state}{advice}"
+    more = "; ".join([check.advice] if check.advice else check.remarks)
+    return f"  {check.kind:8}  {f'{check.name} {check.version}'.strip():32}  {state}{f': {more}' if more else ''}"

@@ -75,6 +75,7 @@ class SegmentSummary:
         num_pieces: connected pieces that came out; 0 when nothing did.
         num_registered: images with a pose, over all its pieces.
         method: how its largest piece was made, in words; empty when nothing came out.
+        doubts: why its geometry should not be trusted.
     """
 
     index: int
@@ -83,6 +84,7 @@ class SegmentSummary:
     num_pieces: int
     num_registered: int
     method: str
+    doubts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,6 +235,12 @@ class RunSummary:
         empty = [str(segment.index) for segment in self.segments if segment.kind == "window" and not segment.num_pieces]
         if empty:
             reasons.append(f"nothing came out of segment {', '.join(empty)}")
+        doubted = [segment for segment in self.segments if segment.doubts]
+        if doubted:
+            reasons.append(
+                f"the geometry of {len(doubted)} of {len(self.segments)} segments should not be trusted, such as "
+                f"segment {doubted[0].index}: {doubted[0].doubts[0]}"
+            )
         return tuple(reasons)
 
     @property

@@ -13,8 +13,10 @@ from typing import Any
 
 import pycolmap
 import pytest
+from room_network import install_package
 
 from smust3r_colmap import __version__, cli, doctor
+from smust3r_colmap.backbones.registry import list_backbones
 from smust3r_colmap.config import RunConfig
 from smust3r_colmap.demo import demo_intrinsics
 from smust3r_colmap.errors import CollectionError, ReconstructionError
@@ -544,6 +546,10 @@ def test_counts_that_contradict_each_other_are_refused() -> None:
         ("ModuleNotFoundError: No module named 'cv2'", "cv2 is not installed; pip install opencv-python-headless"),
         ("ModuleNotFoundError: No module named 'open3d'", "open3d is not installed; pip install open3d"),
         ("Traceback ...\nValueError: odd", "cannot be imported: ValueError: odd"),
+        (
+            "ModuleNotFoundError: No module named 'net'\nsmust3r_colmap.errors.MissingDependencyError: fetch net.zip",
+            "fetch net.zip",
+        ),
         ("", "cannot be imported: no message"),
     ],
 )
@@ -554,6 +560,7 @@ def test_doctor_says_what_to_install(stderr: str, advice: str) -> None:
 def _small_doctor(monkeypatch: pytest.MonkeyPatch, packages: tuple[tuple[str, str], ...]) -> None:
     monkeypatch.setattr(doctor, "_PACKAGES", packages)
     monkeypatch.setattr(doctor, "_PARTS", (("exporter", "PLY cloud", "smust3r_colmap.exporters.ply"),))
+    monkeypatch.setattr(doctor, "list_backbones", tuple)
 
 
 def test_doctor_survives_packages_that_abort_hang_or_are_missing(
@@ -591,3 +598,58 @@ def test_doctor_is_content_without_open3d(monkeypatch: pytest.MonkeyPatch, capsy
     assert "not usable, not needed" in out
     assert "Everything needed works." in out
     assert "accelerators: none" in out
+
+
+def test_doctor_says_of_every_backbone_what_it_lacks(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    install_package(tmp_path, "other-net", "[smust3r_colmap.backbones]\nothernet = other_net:make\n")
+    (tmp_path / "other_net.py").write_text("import no_such_package", encoding="utf-8")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(doctor, "_PACKAGES", (("pillow", "import PIL"),))
+    monkeypatch.setattr(doctor, "_PARTS", (("exporter", "PLY cloud", "smust3r_colmap.exporters.ply"),))
+    monkeypatch.setattr(doctor, "_MORE_OF_BACKBONE", {"classical": "print('fast')\nprint('and sound')"})
+    monkeypatch.setattr(
+        doctor,
+        "list_backbones",
+        lambda: [known for known in list_backbones() if known.name in ("classical", "othernet")],
+    )
+
+    assert cli.main(["doctor"]) == 0, "no more than the classical backbone is needed"
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[:2] for line in lines[3:-1]] == [
+        ["package", "pillow"],
+        ["backbone", "classical"],
+        ["backbone", "othernet"],
+        ["exporter", "PLY"],
+    ]
+    assert lines[4].endswith("works: fast; and sound")
+    assert "othernet (of other-net) 1.0" in lines[5]
+    assert "not usable, not needed: backbone othernet of the package other-net" in lines[5]
+    assert "No module named 'no_such_package'" in lines[5]
+
+
+def test_doctor_says_whether_must3r_has_its_weights(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(doctor, "_PACKAGES", (("pillow", "import PIL"),))
+    monkeypatch.setattr(doctor, "_PARTS", (("exporter", "PLY cloud", "smust3r_colmap.exporters.ply"),))
+    monkeypatch.setattr(
+        doctor, "list_backbones", lambda: [known for known in list_backbones() if known.name == "must3r"]
+    )
+    monkeypatch.setenv("SMUST3R_CACHE", str(tmp_path))
+    monkeypatch.delenv("SMUST3R_WEIGHTS", raising=False)
+    weights = tmp_path / "network.pth"
+    weights.touch()
+
+    remarks = []
+    for named in ("", str(weights)):
+        monkeypatch.setenv("SMUST3R_WEIGHTS", named)
+        assert cli.main(["doctor", "--json"]) == 0
+        (check,) = [one for one in json.loads(capsys.readouterr().out)["checks"] if one["kind"] == "backbone"]
+        assert check["works"], check["advice"]
+        remarks.append(check["remarks"])
+    assert all(re.search("float32|bfloat16", one[0]) for one in remarks)
+    assert remarks[0][-1].startswith("no weights for --network-size 512")
+    assert remarks[1][-1] == f"weights: {weights}"

@@ -1,22 +1,30 @@
-"""What every backbone is to the pipeline."""
+"""What every backbone is to the pipeline, and what the pipeline gives it.
+
+``registry`` finds backbones by name. Those that are networks start from ``feed_forward``, which keeps their
+predictions on disk and turns them into pieces.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from smust3r_colmap.config import RunConfig
 from smust3r_colmap.products import (
     DenseMaps,
     FeatureLinks,
+    ImageCollection,
     RejectedImage,
     Segment,
     SegmentPiece,
     SegmentReconstruction,
 )
+from smust3r_colmap.progress import Reporter
+from smust3r_colmap.run_directory import RunDirectory
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,4 +75,38 @@ class Backbone(Protocol):
         Args:
             segments: of the run, windows and loops; ``segments[k].index == k``.
             with_maps: indices of the segments whose dense maps will be read; those of the others may be empty.
+        """
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BackboneContext:
+    """All that a backbone is made from.
+
+    Args:
+        collection: the images of the run.
+        config: every setting; ``options`` are those that only the backbone understands.
+        options: what ``--backbone-options`` says.
+        run: where finished work is kept.
+        reporter: told about every stage.
+        workers: processes or threads that may run at once, at least one.
+    """
+
+    collection: ImageCollection
+    config: RunConfig
+    options: Mapping[str, str]
+    run: RunDirectory
+    reporter: Reporter
+    workers: int
+
+
+class BackboneFactory(Protocol):
+    """What an entry point of the group ``smust3r_colmap.backbones`` names: a class or a function."""
+
+    def __call__(self, context: BackboneContext) -> Backbone:
+        """The backbone of one run.
+
+        Raises:
+            ConfigError: a setting or an option makes no sense.
+            MissingDependencyError: a package is not installed.
+            CheckpointError: the weights cannot be used.
         """
