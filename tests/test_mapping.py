@@ -22,7 +22,6 @@ from smust3r_colmap.backbones.classical.calibration import (
     CalibrationTask,
     agree_on_cameras,
     calibrate_segment,
-    weighted_median,
 )
 from smust3r_colmap.backbones.classical.descriptors import vlad_descriptors
 from smust3r_colmap.backbones.classical.features import (
@@ -54,6 +53,7 @@ from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.products import ImageCollection, Segment, SourceImage, Tracks
 from smust3r_colmap.progress import QuietReporter
 from smust3r_colmap.run_directory import RunDirectory
+from smust3r_colmap.statistics import weighted_median
 
 NUM_IMAGES = 8
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -311,11 +312,13 @@ def _read(
             tracks=None,
         )
         pieces = (piece,)
+    unregistered = tuple(UnregisteredImage(**one) for one in facts["unregistered"])
+    reasons = Counter(one.reason for one in unregistered).most_common(1 if not pieces else 0)
     reconstruction = SegmentReconstruction(
         segment=segment.index,
         pieces=pieces,
-        unregistered=tuple(UnregisteredImage(**one) for one in facts["unregistered"]),
-        attempts=(facts["method"], *facts["notes"]),
+        unregistered=unregistered,
+        attempts=(facts["method"], *(f"{count} images: {reason}" for reason, count in reasons), *facts["notes"]),
         metric=metric,
         doubts=tuple(facts["doubts"]),
     )

@@ -7,7 +7,7 @@ Camera axes: x right, y down, z forward.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -79,6 +79,12 @@ class Intrinsics:
         camera = self.colmap_camera()
         camera.rescale(width, height)
         return Intrinsics.from_colmap(camera)
+
+    def zoomed(self, factor: float) -> Intrinsics:
+        """The same camera with its focal lengths multiplied."""
+        focal = set(self.colmap_camera().focal_length_idxs())
+        params = tuple(value * factor if k in focal else value for k, value in enumerate(self.params))
+        return replace(self, params=params)
 
     def rays_cam(self, xy_img: npt.ArrayLike) -> FloatArray:
         """Directions (N, 3) with z = 1 of image points (N, 2); NaN where undistortion fails."""

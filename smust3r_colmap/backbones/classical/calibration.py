@@ -14,7 +14,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
 from smust3r_colmap.backbones.classical.features import internal_name, open_database
@@ -24,6 +23,7 @@ from smust3r_colmap.backbones.classical.model_checks import diverged_focal
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import UnregisteredImage
+from smust3r_colmap.statistics import weighted_median
 
 logger = logging.getLogger(__name__)
 
@@ -75,13 +75,6 @@ def agree_on_cameras(
         median = tuple(weighted_median(values[:, column], weights) for column in range(values.shape[1]))
         agreed[camera] = replace(priors[camera], params=median)
     return agreed
-
-
-def weighted_median(values: npt.NDArray[np.float64], weights: npt.NDArray[np.float64]) -> float:
-    """The value at which half of the weight is reached, interpolated between neighbours."""
-    order = np.argsort(values, kind="stable")
-    cumulative = np.cumsum(weights[order]) - 0.5 * weights[order]
-    return float(np.interp(0.5 * weights.sum(), cumulative, values[order]))
 
 
 def calibrate_segment(task: CalibrationTask) -> MappedSegment:

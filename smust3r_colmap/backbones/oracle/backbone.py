@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -331,7 +331,7 @@ class OracleBackbone:
         cameras = homogeneous(self.truth.world_from_cam[list(images)])
         seg_from_cam = _rigid_parts(geometry.seg_from_world @ cameras)
         sizes = [(self.collection.images[image].width, self.collection.images[image].height) for image in images]
-        estimated = {size: _zoomed(self.truth.intrinsics.resized(*size), geometry.focal_factor) for size in set(sizes)}
+        estimated = {size: self.truth.intrinsics.resized(*size).zoomed(geometry.focal_factor) for size in set(sizes)}
         if geometry.is_warped:
             rays_cam = estimated[sizes[0]].resized(*RAYS_ACROSS).rays_cam(pixel_centres(*RAYS_ACROSS))
             seg_from_cam = warped_cameras(geometry.warp, seg_from_cam, rays_cam)
@@ -394,13 +394,6 @@ def _rigid_parts(b_from_cam: FloatArray) -> FloatArray:
     out: FloatArray = b_from_cam[..., :3, :].copy()
     out[..., :3] /= np.cbrt(np.linalg.det(out[..., :3]))[..., None, None]
     return out
-
-
-def _zoomed(intrinsics: Intrinsics, factor: float) -> Intrinsics:
-    """The same camera with its focal lengths multiplied."""
-    focal = set(intrinsics.colmap_camera().focal_length_idxs())
-    params = tuple(value * factor if k in focal else value for k, value in enumerate(intrinsics.params))
-    return replace(intrinsics, params=params)
 
 
 # ------------------------------------------------------------------------------- scoring

@@ -1,0 +1,106 @@
+"""The network as one value, and what one can ask of it; the functions here are the package's interface."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from smust3r_colmap.backbones.must3r.architecture import Architecture, MemoryMode
+from smust3r_colmap.backbones.must3r.decoder import Decoder
+from smust3r_colmap.backbones.must3r.encoder import EncodedImage, Encoder
+from smust3r_colmap.backbones.must3r.memory import Memory
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Network:
+    """Encoder and decoder with their weights, ready to run.
+
+    Args:
+        architecture: what the two were built from.
+        device: where the weights lie.
+        dtype: float32, the reference; or bfloat16, by autocast.
+    """
+
+    architecture: Architecture
+    encoder: Encoder
+    decoder: Decoder
+    device: torch.device
+    dtype: torch.dtype = torch.float32
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """No gradients, and arithmetic in the network's number type."""
+        with torch.no_grad(), torch.autocast(self.device.type, self.dtype, enabled=self.dtype != torch.float32):
+            yield
+
+
+def remembering_as(network: Network, mode: MemoryMode) -> Network:
+    """The same weights with another form of memory; the results are the same (section 5.1)."""
+    if mode == network.architecture.decoder.memory_mode:
+        return network
+    architecture = replace(network.architecture, decoder=replace(network.architecture.decoder, memory_mode=mode))
+    with torch.device("meta"):
+        decoder = Decoder(architecture.decoder)
+    decoder.load_state_dict(network.decoder.state_dict(), assign=True)
+    decoder.requires_grad_(False).eval()
+    return replace(network, architecture=architecture, decoder=decoder)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MemoryUpdate:
+    """A memory that holds the new images too, and the output of the head for each of them.
+
+    Args:
+        memory: the old images and the new.
+        raw: one (H, W, 7) float32 per new image, before activation.
+    """
+
+    memory: Memory
+    raw: tuple[Tensor, ...]
+
+
+def encode(network: Network, images: Sequence[Tensor], *, batch_size: int = 1) -> tuple[EncodedImage, ...]:
+    """Features of images (3, H, W) float32 in [-1, 1], H and W multiples of the patch (``preprocess`` makes them).
+
+    Raises:
+        ValueError: a shape that is not as said.
+    """
+    with network.running():
+        return network.encoder.encode(
+            [image.to(network.device, non_blocking=True) for image in images], batch_size=batch_size
+        )
+
+
+def init_memory(network: Network, images: Sequence[EncodedImage], *, reserve: int = 0) -> MemoryUpdate:
+    """A memory of these images; the first is the reference: its camera frame is the world frame.
+
+    Args:
+        images: at least one, of any shapes, in the order in which they are numbered.
+        reserve: tokens to make room for, so that later updates need not move the memory.
+    """
+    with network.running():
+        seen = network.decoder.see(images, None)
+        return MemoryUpdate(memory=Memory.of(seen.remembered, reserve=reserve), raw=seen.raw)
+
+
+def update_memory(network: Network, memory: Memory, images: Sequence[EncodedImage]) -> MemoryUpdate:
+    """The memory with these images added in one step; the given memory stays valid."""
+    with network.running():
+        seen = network.decoder.see(images, memory)
+        return MemoryUpdate(memory=memory.extended(seen.remembered), raw=seen.raw)
+
+
+def render(
+    network: Network, memory: Memory, images: Sequence[EncodedImage], *, batch_size: int = 1
+) -> tuple[Tensor, ...]:
+    """(H, W, 7) float32 per image, before activation, against the whole memory; images do not see each other."""
+    with network.running():
+        return tuple(
+            raw
+            for start in range(0, len(images), batch_size)
+            for raw in network.decoder.render(images[start : start + batch_size], memory)
+        )
