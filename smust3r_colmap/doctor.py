@@ -253,5 +253,6 @@ def _memory_bytes() -> int:
 
 def _check_line(check: Check) -> str:
     state = "works" if check.works else ("BROKEN" if check.needed else "not usable, not needed")
-    more = "; ".join([check.advice] if check.advice else check.remarks)
-    return f"  {check.kind:8}  {f'{check.name} {check.version}'.strip():32}  {state}{f': {more}' if more else ''}"
+    advice = f": {check.advice}" if check.advice else ""
+    line = f"  {check.kind:8}  {f'{check.name} {check.version}'.strip():32}  {state}{advice}"
+    return "\n".join([line, *(f"{'':12}{remark}" for remark in check.remarks)])

@@ -370,7 +370,7 @@ class Must3rPredictor:
             calibrated=self.collection.calibrated,
         )
         reasons = [camera.reason for camera in fitted if isinstance(camera, NoCamera)]
-        if len(fitted) - len(reasons) >= MIN_IMAGES:
+        if not reasons or len(fitted) - len(reasons) >= MIN_IMAGES:
             return fitted, ()
         doubt = f"its pointmaps gave no cameras, so these are guesses ({reasons[0]})"
         return guess_cameras(sightings, owners, cameras), (doubt,)

@@ -70,7 +70,7 @@ class Encoder(nn.Module):
         a = self.architecture
         rows, columns = (side // a.patch_size for side in images.shape[-2:])
         table = rope_table(grid_positions(rows, columns, images.device), a.width // a.num_heads, a.rope)
-        tokens = self.patch_embed(images)
+        tokens = self.patch_embed(images).float()  # so is the sum of the blocks: bfloat16 would double its error
         for block in self.blocks_enc:
             tokens = block(tokens, table)
         features: Tensor = self.norm_enc(tokens)
