@@ -259,6 +259,24 @@ def test_memory_that_runs_out_in_the_middle_costs_keyframes_and_is_told(
     assert prediction.method.endswith(f"{keyframes[-1]} keyframes")
 
 
+def test_progress_moves_while_keyframes_are_remembered(
+    predictor: Callable[..., Must3rPredictor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage, seen = stage_of(6), []
+    real = drivers.reconstruct_segment
+
+    def watched(*arguments: Any, **options: Any) -> Iterator[Any]:
+        for prediction in real(*arguments, **options):
+            seen.append(stage.done)
+            yield prediction
+
+    monkeypatch.setattr(backbone_module, "reconstruct_segment", watched)
+    predictor().predict(SEGMENT, stage)
+    assert 1 <= seen[0] <= 3, "half of the work is done before the first prediction"
+    assert seen == sorted(seen)
+    assert stage.done == 6
+
+
 def test_an_error_that_is_no_lack_of_memory_is_not_retried(
     predictor: Callable[..., Must3rPredictor], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,7 +13,7 @@ all the same is tried again with less. Source: paper, section III-A; network spe
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -261,10 +261,10 @@ class Must3rPredictor:
         """See ``Predictor``. Memory that runs out in the middle costs keyframes, not the segment."""
         plan = self._plan(segment)
         notes = [plan.text]
-        progress = _Progress(stage)
+        progress = _Progress(stage, len(segment.images))
         while True:
             try:
-                sights = self._look(segment, plan, progress.advance)
+                sights = self._look(segment, plan, progress)
                 break
             except (MemoryError, RuntimeError) as error:
                 if not is_out_of_memory(error):
@@ -274,7 +274,7 @@ class Must3rPredictor:
             plan = fewer(plan)
             notes.append(f"memory ran out ({failure}); tried again with {plan.text}")
             self._reporter.warn(f"segment {segment.index}: {notes[-1]}")
-            progress.start_again()
+        progress.finish()
         return self._prediction(segment, sights, notes)
 
     def _plan(self, segment: Segment) -> MemoryPlan:
@@ -299,8 +299,9 @@ class Must3rPredictor:
             on_card=self._device.type == "cuda",
         )
 
-    def _look(self, segment: Segment, plan: MemoryPlan, advance: Callable[[], None]) -> list[_Sight]:
+    def _look(self, segment: Segment, plan: MemoryPlan, progress: _Progress) -> list[_Sight]:
         """What the network says of every image of the segment, in order."""
+        progress.expect((1 + self.settings.refinements) * plan.num_keyframes + len(segment.images))
         images = self._cache.images(
             [self.collection.images[index].digest for index in segment.images],
             lambda k: encode(self._network, [self._pixels(segment.images[k])])[0],
@@ -313,6 +314,7 @@ class Must3rPredictor:
             refinements=self.settings.refinements,
             rerender=self.settings.rerender,
             batch_size=plan.render_batch,
+            on_memory=lambda _: progress.step(),
         ):
             pointmaps = activate(prediction.raw, self._network.architecture.decoder.activation)
             window = self._window(segment.images[prediction.index])
@@ -322,7 +324,7 @@ class Must3rPredictor:
                 confidence=pointmaps.confidence.cpu().numpy(),
                 is_keyframe=prediction.is_keyframe,
             )
-            advance()
+            progress.step()
         return [sights[k] for k in range(len(segment.images))]
 
     def _choice(self, most: int, images: Sequence[EncodedImage]) -> KeyframeChoice:
@@ -406,19 +408,28 @@ def _doubts(cameras: Sequence[FittedCamera]) -> tuple[str, ...]:
 
 
 class _Progress:
-    """Counts every image once, however often its segment is tried."""
+    """Counts every image once, however often the network looks at it and its segment is tried."""
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, stage: Stage, num_images: int) -> None:
         self._stage = stage
-        self._shown = self._done = 0
+        self._num_images = num_images
+        self._steps, self._expected, self._shown = 0, 1, 0
 
-    def advance(self) -> None:
-        """One more image."""
-        self._done += 1
-        if self._done > self._shown:
-            self._shown = self._done
-            self._stage.advance()
+    def expect(self, steps: int) -> None:
+        """So many steps from here to the end of the segment; what was shown before stays."""
+        self._steps, self._expected = 0, steps
 
-    def start_again(self) -> None:
-        """From the first image."""
-        self._done = 0
+    def step(self) -> None:
+        """An image was remembered or predicted."""
+        self._steps += 1
+        self._show(self._num_images * self._steps // self._expected)
+
+    def finish(self) -> None:
+        """All images are done, whatever was expected."""
+        self._show(self._num_images)
+
+    def _show(self, count: int) -> None:
+        more = min(count, self._num_images) - self._shown
+        if more > 0:
+            self._shown += more
+            self._stage.advance(more)

@@ -80,9 +80,14 @@ def estimate_focal(points_cam: npt.ArrayLike | Tensor, *, dtype: type[np.floatin
         At least 0, which is no focal length and comes out where most points lie behind the camera; NaN where no
         ray has a length.
 
+    Raises:
+        ValueError: another shape.
+
     Source: the network specification, section 11.1.
     """
     points = _as_array(points_cam).astype(dtype)
+    if points.ndim != 3 or points.shape[2] != 3:
+        raise ValueError(f"points {points.shape}; (H, W, 3) of one image are needed")
     height, width = points.shape[:2]
     x, y = np.meshgrid(np.arange(width, dtype=dtype) - width / 2, np.arange(height, dtype=dtype) - height / 2)
     pixels = np.stack([x, y], axis=-1).astype(dtype)  # (H, W, 2)
@@ -105,15 +110,22 @@ def register_camera(
     Minimises sum w |R p_cam + t - p_world|^2 over all pixels, with w = confidence - 1.
 
     Args:
-        points_cam, points_world: (..., 3). confidence: (...).
+        points_cam, points_world: (H, W, 3) or (N, 3). confidence: (H, W) or (N,).
 
     Raises:
+        ValueError: other shapes, such as those of many images.
         DegenerateAlignmentError: a point or a confidence is not finite, or no pixel has a confidence above 1.
 
     Source: the network specification, section 11.2.
     """
-    cam, world = (_as_array(points).reshape(-1, 3).astype(np.float64) for points in (points_cam, points_world))
-    weights = _as_array(confidence).reshape(-1).astype(np.float64) - 1
+    cam, world, certain = (_as_array(values) for values in (points_cam, points_world, confidence))
+    if cam.shape != world.shape or cam.shape != (*certain.shape, 3) or certain.ndim > 2:
+        raise ValueError(
+            f"points {cam.shape} and {world.shape}, confidence {certain.shape}; (H, W, 3) twice and (H, W) of one "
+            "image are needed"
+        )
+    cam, world = (points.reshape(-1, 3).astype(np.float64) for points in (cam, world))
+    weights = certain.reshape(-1).astype(np.float64) - 1
     finite = np.isfinite(cam).all(axis=1) & np.isfinite(world).all(axis=1) & np.isfinite(weights)
     if not finite.all() or not weights.sum() > 0:
         raise DegenerateAlignmentError(

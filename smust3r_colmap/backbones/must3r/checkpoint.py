@@ -54,12 +54,15 @@ def load_checkpoint(
         image_size: longer side of the images to run at; by default the size that the file names.
         memory_mode: what the decoder remembers; by default as the file says. Results are the same.
         device: where the weights go.
-        dtype: of the arithmetic; the weights are float32 always, and are converted where the file has others.
+        dtype: of the arithmetic, float32 or bfloat16; the weights are float32 always, and are converted where the
+            file has others.
 
     Raises:
         CheckpointError: the file is damaged, of another network, incomplete, or names what is not built here.
-        ConfigError: an image size, memory or device that cannot be.
+        ConfigError: an image size, memory, device or number type that cannot be.
     """
+    if dtype not in (torch.float32, torch.bfloat16):
+        raise ConfigError(f"number type {dtype}: torch.float32 or torch.bfloat16")
     stored = _read(Path(path))
     architecture = _at_size(stored, image_size)
     if memory_mode is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import get_args
 
 import torch
 from torch import Tensor, nn
@@ -45,7 +46,15 @@ class Pointmaps:
 
 
 def activate(raw: Tensor, activation: PointActivation = "norm_exp") -> Pointmaps:
-    """(..., H, W, 7) output of the head to points and confidence."""
+    """(..., H, W, 7) output of the head to points and confidence.
+
+    Raises:
+        ValueError: the last axis is not that of the channels, or the activation is unknown.
+    """
+    if raw.shape[-1] != CHANNELS:
+        raise ValueError(f"raw output {tuple(raw.shape)}; (..., H, W, {CHANNELS}) is needed")
+    if activation not in get_args(PointActivation):
+        raise ValueError(f"activation {activation!r}: one of {', '.join(get_args(PointActivation))}")
     return Pointmaps(
         points_world=_activate_points(raw[..., :3], activation),
         points_cam=_activate_points(raw[..., 3:6], activation),

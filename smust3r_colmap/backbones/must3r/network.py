@@ -64,15 +64,22 @@ class MemoryUpdate:
 
 
 def encode(network: Network, images: Sequence[Tensor], *, batch_size: int = 1) -> tuple[EncodedImage, ...]:
-    """Features of images (3, H, W) float32 in [-1, 1], H and W multiples of the patch (``preprocess`` makes them).
+    """Features of images (3, H, W) in [-1, 1], H and W multiples of the patch (``preprocess`` makes them).
+
+    Args:
+        images: of any shapes; floating-point numbers of any width, which become float32.
+        batch_size: neighbours of one shape that go together at most.
 
     Raises:
-        ValueError: a shape that is not as said.
+        ValueError: a shape or a number type that is not as said, or the batch is none.
     """
+    _check_batch(batch_size)
+    for number, image in enumerate(images):
+        if not image.is_floating_point():
+            raise ValueError(f"image {number}: {image.dtype}, needed are floating-point numbers from -1 to 1")
+    pixels = [image.to(network.device, torch.float32, non_blocking=True) for image in images]
     with network.running():
-        return network.encoder.encode(
-            [image.to(network.device, non_blocking=True) for image in images], batch_size=batch_size
-        )
+        return network.encoder.encode(pixels, batch_size=batch_size)
 
 
 def init_memory(network: Network, images: Sequence[EncodedImage], *, reserve: int = 0) -> MemoryUpdate:
@@ -81,14 +88,23 @@ def init_memory(network: Network, images: Sequence[EncodedImage], *, reserve: in
     Args:
         images: at least one, of any shapes, in the order in which they are numbered.
         reserve: tokens to make room for, so that later updates need not move the memory.
+
+    Raises:
+        ValueError: there is no image.
     """
+    _check_some(images)
     with network.running():
         seen = network.decoder.see(images, None)
         return MemoryUpdate(memory=Memory.of(seen.remembered, reserve=reserve), raw=seen.raw)
 
 
 def update_memory(network: Network, memory: Memory, images: Sequence[EncodedImage]) -> MemoryUpdate:
-    """The memory with these images added in one step; the given memory stays valid."""
+    """The memory with these images added in one step; the given memory stays valid.
+
+    Raises:
+        ValueError: there is no image.
+    """
+    _check_some(images)
     with network.running():
         seen = network.decoder.see(images, memory)
         return MemoryUpdate(memory=memory.extended(seen.remembered), raw=seen.raw)
@@ -97,10 +113,25 @@ def update_memory(network: Network, memory: Memory, images: Sequence[EncodedImag
 def render(
     network: Network, memory: Memory, images: Sequence[EncodedImage], *, batch_size: int = 1
 ) -> tuple[Tensor, ...]:
-    """(H, W, 7) float32 per image, before activation, against the whole memory; images do not see each other."""
+    """(H, W, 7) float32 per image, before activation, against the whole memory; images do not see each other.
+
+    Raises:
+        ValueError: the batch is none.
+    """
+    _check_batch(batch_size)
     with network.running():
         return tuple(
             raw
             for start in range(0, len(images), batch_size)
             for raw in network.decoder.render(images[start : start + batch_size], memory)
         )
+
+
+def _check_batch(batch_size: int) -> None:
+    if batch_size < 1:
+        raise ValueError(f"batch_size {batch_size}: at least 1 is needed")
+
+
+def _check_some(images: Sequence[EncodedImage]) -> None:
+    if not images:
+        raise ValueError("no image to remember; at least 1 is needed")

@@ -272,7 +272,7 @@ def _half(side: int) -> int:
 
 def _rgb(image: UInt8Array | Image.Image) -> UInt8Array:
     """(H, W, 3) uint8."""
-    photo = np.asarray(image.convert("RGB")) if isinstance(image, Image.Image) else image
+    photo = np.asarray(image.convert("RGB") if isinstance(image, Image.Image) else image)
     if photo.ndim != 3 or photo.shape[2] != 3 or photo.dtype != np.uint8 or photo.size == 0:
         raise ValueError(f"image of shape {photo.shape} and type {photo.dtype}; (H, W, 3) uint8 is needed")
     return photo
