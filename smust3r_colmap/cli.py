@@ -234,6 +234,7 @@ def _reporting(*, quiet: bool, verbose: bool) -> Iterator[Reporter]:
     reporter = reporter_for(sys.stderr, quiet=quiet)
     handler = _ReporterHandler(reporter)
     package_logger = logging.getLogger("smust3r_colmap")
+    level_before = package_logger.level
     package_logger.addHandler(handler)
     package_logger.setLevel(logging.DEBUG if verbose else logging.WARNING)
     package_logger.propagate = False
@@ -241,6 +242,7 @@ def _reporting(*, quiet: bool, verbose: bool) -> Iterator[Reporter]:
         yield reporter
     finally:
         package_logger.removeHandler(handler)
+        package_logger.setLevel(level_before)
         package_logger.propagate = True
 
 

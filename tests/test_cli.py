@@ -343,6 +343,19 @@ def test_library_warnings_reach_the_user_and_debug_only_if_verbose(
     assert talkative == "warning: blurred\ndetail\n"
 
 
+@pytest.mark.parametrize("level", [logging.NOTSET, logging.INFO])
+def test_logging_is_left_as_it_was_found(put_pipeline: PutPipeline, level: int) -> None:
+    put_pipeline(lambda *_, **__: GOOD)
+    logger = logging.getLogger("smust3r_colmap")
+    before = (logger.level, tuple(logger.handlers), logger.propagate)
+    try:
+        logger.setLevel(level)
+        cli.main(RECONSTRUCT)
+        assert (logger.level, tuple(logger.handlers), logger.propagate) == (level, *before[1:])
+    finally:
+        logger.setLevel(before[0])
+
+
 # --------------------------------------------------------------------------- progress
 class _Clock:
     """Seconds that pass when told to."""

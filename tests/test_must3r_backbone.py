@@ -8,6 +8,7 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ import torch
 
 from smust3r_colmap.backbones.base import BackboneContext
 from smust3r_colmap.backbones.must3r import backbone as backbone_module
-from smust3r_colmap.backbones.must3r import drivers, network
+from smust3r_colmap.backbones.must3r import drivers, memory_plan, network
 from smust3r_colmap.backbones.must3r.architecture import (
     Architecture,
     DecoderArchitecture,
@@ -88,9 +89,9 @@ def untrained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def reconstruct(images: Path, output: Path, weights: Path, *flags: str) -> int:
-    """The command line, in this process."""
+    """The command line, in this process. Tiny matrices on many threads wait for each other where cores are shared."""
     command = ["reconstruct", str(images), "--output", str(output), "--backbone", "must3r", "--weights", str(weights)]
-    return main([*command, "--network-size", "64", "--quiet", *flags])
+    return main([*command, "--network-size", "64", "--workers", "1", "--quiet", *flags])
 
 
 @pytest.fixture
@@ -259,6 +260,49 @@ def test_memory_that_runs_out_in_the_middle_costs_keyframes_and_is_told(
     assert prediction.method.endswith(f"{keyframes[-1]} keyframes")
 
 
+class _Listening(QuietReporter):
+    """Remembers the notes."""
+
+    def __init__(self) -> None:
+        super().__init__(sys.stderr)
+        self.notes: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+
+def test_the_plan_is_said_before_the_segment_runs_and_again_when_it_changes(
+    predictor: Callable[..., Must3rPredictor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said_before: list[int] = []
+    heard = _Listening()
+    made = predictor()
+    made._reporter = heard
+    real = drivers.reconstruct_segment
+
+    def watched(*arguments: Any, **options: Any) -> Iterator[Any]:
+        said_before.append(sum("keyframes in" in note for note in heard.notes))
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(backbone_module, "reconstruct_segment", watched)
+    for images in (range(6), range(2, 8), range(3)):
+        prediction = made.predict(replace(SEGMENT, images=tuple(images)), stage_of(len(images)))
+        assert prediction.notes == ()
+    assert said_before == [1, 1, 2]
+
+
+def test_keyframes_that_do_not_fit_are_missed_in_the_notes(
+    predictor: Callable[..., Must3rPredictor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def scarce(*arguments: Any, **options: Any) -> memory_plan.MemoryPlan:
+        return replace(memory_plan.plan_memory(*arguments, **options), num_keyframes=4)
+
+    monkeypatch.setattr(backbone_module, "plan_memory", scarce)
+    prediction = predictor().predict(SEGMENT, stage_of(6))
+    assert prediction.notes == ("4 of 6 keyframes, for lack of memory",)
+    assert prediction.method.endswith(" 4 keyframes")
+
+
 def test_progress_moves_while_keyframes_are_remembered(
     predictor: Callable[..., Must3rPredictor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -308,6 +352,25 @@ def test_descriptors_are_of_unit_length_and_tell_images_apart(predictor: Callabl
     assert descriptors.shape == (NUM_IMAGES, 64)
     assert np.linalg.norm(descriptors, axis=1) == pytest.approx(1, abs=1e-5)
     assert len(np.unique(descriptors.round(6), axis=0)) == NUM_IMAGES
+
+
+def test_images_that_are_too_many_at_once_are_encoded_one_by_one(
+    predictor: Callable[..., Must3rPredictor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = predictor().describe()
+    sizes: list[int] = []
+    real = network.encode
+
+    def tight(asked: Any, images: Any, *, batch_size: int = 1) -> Any:
+        sizes.append(batch_size)
+        if batch_size > 1:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        return real(asked, images, batch_size=batch_size)
+
+    monkeypatch.setattr(backbone_module, "encode", tight)
+    monkeypatch.setattr(backbone_module, "_encoded_at_once", lambda device: 4)
+    assert predictor().describe() == pytest.approx(expected, abs=1e-6)
+    assert set(sizes) == {4, 1, 2}, "14 images are three batches of four and one of two"
 
 
 # ----------------------------------------------------------------------------- refusals

@@ -90,6 +90,19 @@ def test_registration_refuses_a_point_that_is_not_finite_and_weights_of_zero() -
         register_camera(points, points, np.ones((4, 4)))
 
 
+def test_pointmaps_of_many_images_and_of_different_shapes_are_refused() -> None:
+    points = np.ones((4, 6, 3))
+    with pytest.raises(ValueError, match=r"points \(1, 4, 6, 3\); \(H, W, 3\) of one image"):
+        estimate_focal(points[None])
+    for cam, world, confidence in (
+        (points[None], points[None], np.ones((1, 4, 6))),
+        (points[:2], points, np.ones((4, 6))),
+        (points, points, np.ones((6, 4))),
+    ):
+        with pytest.raises(ValueError, match=r"\(H, W\) of one image are needed"):
+            register_camera(cam, world, confidence)
+
+
 # --------------------------------------------------------------------- simulated network
 NET = (96, 128)
 ORIGINAL = (600, 800)

@@ -342,6 +342,41 @@ def test_images_of_other_shapes_are_refused(shape: tuple[int, ...]) -> None:
         encode(random_network(), [torch.zeros(3, 16, 16), torch.zeros(shape)])
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
+def test_images_of_any_float_are_the_same_images(dtype: torch.dtype) -> None:
+    network = random_network()
+    image = (torch.randint(-128, 128, (3, 16, 32), generator=torch.Generator().manual_seed(1)) / 128).to(dtype)
+    expected = encode(network, [image.float()])[0].features
+    assert torch.equal(encode(network, [image])[0].features, expected)
+    if dtype == torch.float64:
+        assert torch.equal(encode(network, [image.numpy()])[0].features, expected)
+    upright = image.transpose(1, 2)  # not contiguous
+    assert torch.equal(
+        encode(network, [upright])[0].features, encode(network, [upright.float().contiguous()])[0].features
+    )
+
+
+def test_what_is_no_image_no_batch_and_no_activation_is_refused() -> None:
+    network = random_network()
+    images = random_images(network)
+    memory = init_memory(network, images[:1]).memory
+    with pytest.raises(ValueError, match=r"image 1: torch.uint8, needed are floating-point numbers from -1 to 1"):
+        encode(network, [torch.zeros(3, 16, 16), torch.zeros(3, 16, 16, dtype=torch.uint8)])
+    for batch_size in (0, -1):
+        with pytest.raises(ValueError, match=rf"batch_size {batch_size}: at least 1"):
+            encode(network, [torch.zeros(3, 16, 16)], batch_size=batch_size)
+        with pytest.raises(ValueError, match=rf"batch_size {batch_size}: at least 1"):
+            render(network, memory, images, batch_size=batch_size)
+    with pytest.raises(ValueError, match="no image to remember"):
+        init_memory(network, [])
+    with pytest.raises(ValueError, match="no image to remember"):
+        update_memory(network, memory, [])
+    with pytest.raises(ValueError, match=r"raw output \(7, 4, 5\); \(..., H, W, 7\) is needed"):
+        activate(torch.zeros(7, 4, 5))
+    with pytest.raises(ValueError, match="activation 'LINEAR': one of norm_exp, linear"):
+        activate(torch.zeros(4, 5, 7), "LINEAR")  # type: ignore[arg-type]
+
+
 def test_features_must_fit_their_grid() -> None:
     with pytest.raises(ValueError, match=r"features \(5, 8\) for 2 x 3 patches"):
         EncodedImage(features=torch.zeros(5, 8), rows=2, columns=3)

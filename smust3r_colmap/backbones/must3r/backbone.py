@@ -85,12 +85,12 @@ MIN_CONFIDENCE = 1.5
 """Median over an image below which the published viewer does not show its camera."""
 MAX_RESIDUAL = 0.1
 """Median distance of the two pointmaps of an image over the depth; where it is more, they are not of one scene."""
+ENCODED_AT_ONCE_ON_CARD = 16
+"""A processor is as fast with one."""
 MIN_SEEN_SHARE = 0.6
 """Of an image by its centre crop, below which the user is told; a square keeps 75 %."""
 DOUBTED_SHARE = 0.5
 """Of the images of a segment that may be unsure or inconsistent before the segment is doubted."""
-ENCODED_AT_ONCE_ON_CARD = 16
-"""A processor is as fast with one."""
 
 
 def make_must3r(context: BackboneContext) -> FeedForwardBackbone:
@@ -184,6 +184,7 @@ class Must3rPredictor:
         self._threads = threads
         self._encoding_key = key_of(fingerprint_of(weights), settings.network_size, str(precision.dtype))
         self._head_key = "" if retrieval is None else fingerprint_of(retrieval)
+        self._said: tuple[object, ...] = ()
 
     @property
     def key(self) -> object:
@@ -208,7 +209,7 @@ class Must3rPredictor:
 
     def _encoded_ahead(self, indices: Sequence[int]) -> Iterator[EncodedImage]:
         """Encoded images in order; files are read while the network is busy, and a card gets many at once."""
-        at_once = ENCODED_AT_ONCE_ON_CARD if self._device.type == "cuda" else 1
+        at_once = _encoded_at_once(self._device)
         with ThreadPoolExecutor(max_workers=min(2, self._threads)) as readers:
             waiting: deque[tuple[int, EncodedImage | None, Future[torch.Tensor] | None]] = deque()
             for index in indices:
@@ -224,12 +225,21 @@ class Must3rPredictor:
     ) -> Iterator[EncodedImage]:
         batch = [waiting.popleft() for _ in range(min(count, len(waiting)))]
         pixels = [loading.result() for _, _, loading in batch if loading is not None]
-        fresh = iter(encode(self._network, pixels, batch_size=count) if pixels else ())
+        fresh = iter(self._encoded(pixels))
         for index, known, _ in batch:
             image = known or next(fresh)
             if image is not known:
                 self._cache.put(self.collection.images[index].digest, image)
             yield image
+
+    def _encoded(self, pixels: Sequence[torch.Tensor]) -> tuple[EncodedImage, ...]:
+        """All at once, or one by one where that is too much for the card."""
+        try:
+            return encode(self._network, pixels, batch_size=max(1, len(pixels)))
+        except (MemoryError, RuntimeError) as error:
+            if len(pixels) < 2 or not is_out_of_memory(error):
+                raise
+        return encode(self._network, pixels, batch_size=1)
 
     def _pixels(self, index: int) -> torch.Tensor:
         """(3, h, w) as the network wants them."""
@@ -260,7 +270,10 @@ class Must3rPredictor:
     def predict(self, segment: Segment, stage: Stage) -> SegmentPrediction:
         """See ``Predictor``. Memory that runs out in the middle costs keyframes, not the segment."""
         plan = self._plan(segment)
-        notes = [plan.text]
+        self._say(plan, segment)
+        notes = (
+            [] if plan.is_full else [f"{plan.num_keyframes} of {plan.wanted_keyframes} keyframes, for lack of memory"]
+        )
         progress = _Progress(stage, len(segment.images))
         while True:
             try:
@@ -276,6 +289,13 @@ class Must3rPredictor:
             self._reporter.warn(f"segment {segment.index}: {notes[-1]}")
         progress.finish()
         return self._prediction(segment, sights, notes)
+
+    def _say(self, plan: MemoryPlan, segment: Segment) -> None:
+        """What a segment is run with, before it runs; once for all segments that are run alike."""
+        alike = (plan.num_keyframes, plan.wanted_keyframes, plan.memory_mode, plan.render_batch)
+        if alike != self._said:
+            self._reporter.note(f"segment {segment.index}: {plan.text}")
+            self._said = alike
 
     def _plan(self, segment: Segment) -> MemoryPlan:
         """What fits into the memory that is free now."""
@@ -387,6 +407,10 @@ class Must3rPredictor:
             intrinsics=camera.intrinsics,
             maps=ImageMaps(depth=whole.depth, confidence=whole.confidence, rgb=np.asarray(rgb, np.uint8)),
         )
+
+
+def _encoded_at_once(device: torch.device) -> int:
+    return ENCODED_AT_ONCE_ON_CARD if device.type == "cuda" else 1
 
 
 def _doubts(cameras: Sequence[FittedCamera]) -> tuple[str, ...]:

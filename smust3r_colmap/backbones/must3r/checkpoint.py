@@ -200,7 +200,7 @@ def _read_official(path: Path) -> _Stored:
     if missing:
         raise CheckpointError(
             f"{path} is no MUSt3R checkpoint: it holds {', '.join(content) or 'nothing'}, but no "
-            f"{' and no '.join(missing)}.{_what_it_may_be(content)}"
+            f"{' and no '.join(missing)}. {_what_it_may_be(content)}"
         )
     strings = tuple(_constructor_string(path, content["args"], part) for part in _PARTS)
     with _damage_named(path):
@@ -215,10 +215,10 @@ def _read_official(path: Path) -> _Stored:
 def _what_it_may_be(content: Mapping[str, object]) -> str:
     args = content.get("args")
     if isinstance(args, argparse.Namespace) and "nclusters" in vars(args):
-        return " It is the head for retrieval, an extra to the weights of the network (--retrieval-weights)"
+        return "It is the head for retrieval, an extra to the weights of the network (--retrieval-weights)"
     if "model" in content:
-        return " It looks like DUSt3R or MASt3R, which are other networks"
-    return ""
+        return "It looks like DUSt3R or MASt3R, which are other networks; `weights list` names those of MUSt3R"
+    return "`weights list` names the files that can be used"
 
 
 def _constructor_string(path: Path, args: object, part: str) -> str:
@@ -247,8 +247,8 @@ def _at_size(stored: _Stored, image_size: int | None) -> Architecture:
         raise ConfigError(f"image size {image_size}: {patch} pixels at least, for that is one patch")
     if not stored.size_is_named:
         raise CheckpointError(
-            f"{path} does not say at which image size it was trained (img_size in both strings), so it runs at "
-            f"{architecture.image_size} pixels only, not at {image_size}"
+            f"{path} does not say at which image size it was trained (the same square img_size in both strings), so it "
+            f"runs at {architecture.image_size} pixels only, not at {image_size}"
         )
     better = f"; {_TRAINED_AT[image_size]} was trained for it" if image_size in _TRAINED_AT else ""
     _log.warning(

@@ -172,19 +172,18 @@ def architecture_from_strings(encoder: str, decoder: str) -> Architecture:
     Raises:
         ValueError: what stands in a string is unknown, or contradicts itself or the other string.
     """
-    architecture = Architecture(encoder=_encoder(_encoder_call(encoder)), decoder=_decoder(_decoder_call(decoder)))
-    sizes = [part.rope.size for part in (architecture.encoder, architecture.decoder)]
-    if sizes[0] != sizes[1]:
-        raise ValueError(f"the encoder is built for images of {sizes[0]} pixels, the decoder for {sizes[1]}")
-    return architecture
+    return Architecture(encoder=_encoder(_encoder_call(encoder)), decoder=_decoder(_decoder_call(decoder)))
 
 
 def image_size_is_named(encoder: str, decoder: str) -> bool:
-    """Whether both strings say for what image size they are, rather than leave it to the default.
+    """Whether both strings say for what image size they are, as the same pair of equal numbers.
 
-    Without it nobody knows how to run the network at another size.
+    The size plays no part in what the network computes, but without it nobody knows how to run the network at
+    another one.
     """
-    return _encoder_call(encoder).has("img_size") and _decoder_call(decoder).has("img_size")
+    calls = (_encoder_call(encoder), _decoder_call(decoder))
+    sides = {side for call in calls for side in _image_sides(call)}
+    return all(call.has("img_size") for call in calls) and len(sides) == 1
 
 
 def _encoder_call(text: str) -> _Constructor:
@@ -234,7 +233,7 @@ def _rope(call: _Constructor) -> Rope:
     parts = _ROPE.fullmatch(name) if isinstance(name, str) else None
     if parts is None or float(parts["base"]) <= 1:
         raise call.error("pos_embed", f"{name!r} is not RoPE<base>, nor RoPE<base>_<trained size>:<size>")
-    image_size = _image_size(call)
+    image_size = max(_image_sides(call))
     if parts["size"] is None:
         return Rope(base=float(parts["base"]), trained_size=image_size, size=image_size)
     trained, size = int(parts["trained"]), int(parts["size"])
@@ -243,12 +242,12 @@ def _rope(call: _Constructor) -> Rope:
     return Rope(base=float(parts["base"]), trained_size=trained, size=size)
 
 
-def _image_size(call: _Constructor) -> int:
+def _image_sides(call: _Constructor) -> tuple[int, int]:
     match call.get("img_size", (_DEFAULT_SIZE, _DEFAULT_SIZE)):
-        case (int() as height, int() as width) if height == width and height > 0:
-            return height
+        case (int() as height, int() as width) if height > 0 and width > 0:
+            return height, width
         case other:
-            raise call.error("img_size", f"{other!r} is not a pair of equal numbers, such as (512, 512)")
+            raise call.error("img_size", f"{other!r} is not a pair of numbers, such as (512, 512)")
 
 
 def _check_norm(call: _Constructor) -> None:

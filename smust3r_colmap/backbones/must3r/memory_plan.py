@@ -133,7 +133,7 @@ class MemoryPlan:
         wanted_keyframes: what was asked for.
         num_keyframes: images that the network remembers.
         memory_mode: how; results do not depend on it.
-        encode_batch, render_batch: images at once.
+        render_batch: images predicted at once; they are encoded one by one.
     """
 
     model: MemoryModel
@@ -141,7 +141,6 @@ class MemoryPlan:
     wanted_keyframes: int
     num_keyframes: int
     memory_mode: MemoryMode
-    encode_batch: int = 1
     render_batch: int = 1
 
     @property
@@ -154,7 +153,7 @@ class MemoryPlan:
         """All that is needed at once at the peak: weights, memory, intermediate results."""
         model, mode, keyframes = self.model, self.memory_mode, self.num_keyframes
         passing = max(
-            model.encoding_bytes(self.encode_batch),
+            model.encoding_bytes(1),
             model.remembering_bytes(mode, keyframes),
             model.rendering_bytes(mode, keyframes, self.render_batch),
         )
@@ -166,12 +165,18 @@ class MemoryPlan:
         return self.working_set_bytes <= self.budget_bytes
 
     @property
+    def is_full(self) -> bool:
+        """It has all the keyframes that were asked for."""
+        return self.num_keyframes == self.wanted_keyframes
+
+    @property
     def text(self) -> str:
         """One line for people."""
-        share = "" if self.num_keyframes == self.wanted_keyframes else f" of {self.wanted_keyframes}"
+        number = str(self.num_keyframes) if self.is_full else f"{self.num_keyframes} of {self.wanted_keyframes}"
+        noun = "keyframe" if self.wanted_keyframes == 1 else "keyframes"
         form = "" if self.memory_mode == "kv" else ", keys and values made anew each time: slower, the same result"
         return (
-            f"{self.num_keyframes}{share} keyframes in {self.memory_bytes / _GIB:.2f} GiB ({self.memory_mode}{form}), "
+            f"{number} {noun} in {self.memory_bytes / _GIB:.2f} GiB ({self.memory_mode}{form}), "
             f"{self.working_set_bytes / _GIB:.2f} of {self.budget_bytes / _GIB:.2f} GiB in all, "
             f"{self.render_batch} predicted at once"
         )
@@ -206,7 +211,7 @@ def plan_memory(
     for mode in dict.fromkeys(("kv", _leanest(model))):
         plan = replace(smallest, num_keyframes=wanted, memory_mode=mode)
         if plan.fits:
-            return _with_batches(plan, min(num_images, _largest_batch(mode, on_card=on_card)), on_card=on_card)
+            return _with_batches(plan, min(num_images, _largest_batch(mode, on_card=on_card)))
     return replace(smallest, num_keyframes=_most_keyframes(smallest, wanted))
 
 
@@ -216,8 +221,8 @@ def fewer(plan: MemoryPlan) -> MemoryPlan:
     Raises:
         ReconstructionError: there is none.
     """
-    if max(plan.encode_batch, plan.render_batch) > 1:
-        return replace(plan, encode_batch=1, render_batch=1)
+    if plan.render_batch > 1:
+        return replace(plan, render_batch=1)
     if plan.memory_mode != _leanest(plan.model):
         return replace(plan, memory_mode=_leanest(plan.model))
     if plan.num_keyframes > 1:
@@ -258,10 +263,10 @@ def _largest_batch(mode: MemoryMode, *, on_card: bool) -> int:
     return 1 if mode == "kv" else _LARGEST_BATCH_REMAKING
 
 
-def _with_batches(plan: MemoryPlan, largest: int, *, on_card: bool) -> MemoryPlan:
+def _with_batches(plan: MemoryPlan, largest: int) -> MemoryPlan:
     """The same keyframes with the largest batches that still fit."""
     for batch in range(largest, 1, -1):
-        larger = replace(plan, encode_batch=batch if on_card else 1, render_batch=batch)
+        larger = replace(plan, render_batch=batch)
         if larger.fits:
             return larger
     return plan

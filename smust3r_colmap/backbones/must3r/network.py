@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -63,7 +66,9 @@ class MemoryUpdate:
     raw: tuple[Tensor, ...]
 
 
-def encode(network: Network, images: Sequence[Tensor], *, batch_size: int = 1) -> tuple[EncodedImage, ...]:
+def encode(
+    network: Network, images: Sequence[Tensor | npt.NDArray[np.floating[Any]]], *, batch_size: int = 1
+) -> tuple[EncodedImage, ...]:
     """Features of images (3, H, W) in [-1, 1], H and W multiples of the patch (``preprocess`` makes them).
 
     Args:
@@ -74,10 +79,11 @@ def encode(network: Network, images: Sequence[Tensor], *, batch_size: int = 1) -
         ValueError: a shape or a number type that is not as said, or the batch is none.
     """
     _check_batch(batch_size)
-    for number, image in enumerate(images):
+    given = [torch.as_tensor(image) for image in images]
+    for number, image in enumerate(given):
         if not image.is_floating_point():
             raise ValueError(f"image {number}: {image.dtype}, needed are floating-point numbers from -1 to 1")
-    pixels = [image.to(network.device, torch.float32, non_blocking=True) for image in images]
+    pixels = [image.to(network.device, torch.float32, non_blocking=True) for image in given]
     with network.running():
         return network.encoder.encode(pixels, batch_size=batch_size)
 

@@ -77,7 +77,7 @@ def choose_precision(wanted: Precision, device: torch.device) -> PrecisionChoice
         case "auto" if fast:
             return PrecisionChoice(torch.bfloat16, f"bfloat16, for {fast}")
         case "auto":
-            return PrecisionChoice(torch.float32, "float32, for it does not multiply bfloat16")
+            return PrecisionChoice(torch.float32, "float32, for bfloat16 would only be emulated")
     raise ConfigError(f"--precision {wanted}: one of {', '.join(get_args(Precision))}")
 
 

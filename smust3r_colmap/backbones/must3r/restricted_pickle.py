@@ -104,7 +104,7 @@ def _check_form(path: Path) -> None:
     if start != _ZIP_START:
         raise CheckpointError(
             f"{path} is no checkpoint: it starts with {start!r}, where a zip archive of torch.save starts with "
-            f"{_ZIP_START!r}"
+            f"{_ZIP_START!r}. Name another file, or fetch this one again"
         )
     if not _has_end(path):
         raise CheckpointError(f"{path} is cut off after {size} bytes: its end is missing. Fetch it again")
