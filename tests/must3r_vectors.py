@@ -15,7 +15,9 @@ import pytest
 from smust3r_colmap.backbones.must3r import Network, load_checkpoint
 from smust3r_colmap.backbones.must3r.architecture import MemoryMode
 
-REFERENCE = Path(os.environ.get("SMUST3R_REFERENCE", Path(__file__).parents[2] / "shared" / "reference"))
+# The reference folder lies beside the data folder, unless told otherwise.
+DATA = Path(os.environ.get("SMUST3R_DATA", Path(__file__).parents[2] / "shared" / "data"))
+REFERENCE = Path(os.environ.get("SMUST3R_REFERENCE", DATA.parent / "reference"))
 FOLDER = REFERENCE / "must3r" / "vectors"
 
 needs_vectors = pytest.mark.skipif(not FOLDER.is_dir(), reason=f"no reference vectors at {FOLDER}")
