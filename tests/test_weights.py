@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from must3r_vectors import REFERENCE
 
 from smust3r_colmap import cli, weights_command
 from smust3r_colmap.errors import CheckpointError, ConfigError, DownloadError
@@ -473,8 +474,7 @@ def test_an_interrupted_fetch_exits_130_and_is_taken_up(fetch: Fetcher) -> None:
 
 # ----------------------------------------------------------------------------- the catalogue
 def test_the_catalogue_is_that_of_the_network_specification() -> None:
-    root = os.environ.get("SMUST3R_REFERENCE", Path(__file__).parents[2] / "shared" / "reference")
-    specification = Path(root) / "must3r" / "SPEC.md"
+    specification = REFERENCE / "must3r" / "SPEC.md"
     if not specification.is_file():
         pytest.skip(f"no network specification at {specification}")
     rows = re.findall(r"^\| `([\w.]+)` \| ([0-9a-f]{32}) \|", specification.read_text(encoding="utf-8"), re.MULTILINE)
