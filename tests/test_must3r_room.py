@@ -8,6 +8,7 @@ length 0.3 %, scale 2.5 %).
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -96,3 +97,23 @@ def test_the_cloud_lies_on_the_walls(finished: tuple[Path, int], found: Evaluati
     to_wall = np.abs(np.abs(points[:, :2]) - [3.0, 2.0]).min(axis=1)
     assert np.mean(beyond > 0.3) < 0.05
     assert np.mean(to_wall < 0.15) > 0.4
+
+
+def test_the_lines_of_the_page_run_and_give_the_cameras(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """BACKBONES.md, "MUSt3R by itself"."""
+    page = (Path(__file__).resolve().parents[1] / "BACKBONES.md").read_text(encoding="utf-8")
+    section = page.partition("## MUSt3R by itself")[2]
+    lines = re.search(r"```python\n(.*?)```", section, re.DOTALL)
+    assert lines, "the page has no such lines"
+    photos = sorted((room / "images").iterdir())[:12:3]
+    names: dict[str, Any] = {"WEIGHTS": STAND_IN, "PHOTOS": photos}
+
+    exec(lines[1], names)
+
+    printed = capsys.readouterr().out
+    assert printed.count("NetworkWindow") == len(photos)
+    truth = read_poses_txt(room / "poses.txt")
+    moved = np.linalg.norm(truth[photos[-1].name][:3, 3] - truth[photos[0].name][:3, 3])
+    assert np.linalg.norm(names["world_from_cam"][:3, 3]) == pytest.approx(moved, rel=0.3), (
+        "of the last image, from the first"
+    )
