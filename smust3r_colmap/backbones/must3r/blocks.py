@@ -73,7 +73,7 @@ class CrossAttention(nn.Module):
         return torch.cat((self.projk(normed), self.projv(normed)), dim=-1)
 
     def forward(self, tokens: Tensor, keys_values: Tensor) -> Tensor:
-        """(N, D) tokens, (M, 2 D) keys and values -> (N, D). N may run over many images, for none has a position."""
+        """(..., N, D) tokens, (..., M, 2 D) keys and values -> (..., N, D). N may run over many images."""
         query = split_heads(self.projq(tokens), self.num_heads)  # (H, N, d)
         key, value = (split_heads(part, self.num_heads) for part in keys_values.chunk(2, dim=-1))  # (H, M, d)
         seen = functional.scaled_dot_product_attention(query[None], key[None], value[None])[0]
