@@ -11,7 +11,8 @@
         features/          database.db: keypoints, descriptors, matches, ids = index + 1
         descriptors/       one vector per image
         loops/             every candidate for a loop, why it was taken or not, the loop segments
-        segments/0000/     mapping/  calibrated/  depth_0/  depth_1/ ...
+        tokens/            images as the MUSt3R network encoded them; the least recently used give way
+        segments/0000/     mapping/  calibrated/  depth_0/  depth_1/ ..., or the prediction of a network
         alignment/         edges between the pieces
         scene/             the fused models, before they are exported
 
