@@ -169,6 +169,23 @@ class Tracks:
             raise ValueError("Tracks: an observation names a point that does not exist")
 
 
+@dataclass(frozen=True, kw_only=True)
+class RunFeatures:
+    """SIFT of all images of the run.
+
+    Args:
+        database: COLMAP database; image id = index + 1, images go by number, not by name.
+        key: hash of what went in.
+        usable: one per image of the collection, whether it has features.
+        rejected: images that have none, and why.
+    """
+
+    database: Path
+    key: str
+    usable: tuple[bool, ...]
+    rejected: tuple[RejectedImage, ...]
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FeatureLinks:
     """Verified matches between features of two images, which tie pieces that share no image.
@@ -378,6 +395,23 @@ class Scene:
 
     def __len__(self) -> int:
         return len(self.image_indices)
+
+
+class DepthMaps(Protocol):
+    """One depth map per image of a model, by image name, read from disk when asked for.
+
+    A map of H x W pixels covers the whole original (distorted) image, uniformly resized, as in ``DenseMaps``.
+    Depth is z in the camera, in units of the stitched world; an adjusted model may differ from it by a factor
+    per image, see ``model_depth``.
+    """
+
+    def __contains__(self, name: str) -> bool: ...
+
+    def depth(self, name: str) -> npt.NDArray[np.float32]:
+        """(H, W) z-depth, 0 where there is none; KeyError for an image without a map."""
+
+    def confidence(self, name: str) -> npt.NDArray[np.float32]:
+        """(H, W), at least 1; 1 means no confidence at all."""
 
 
 EMPTY_CLOUD = PointCloud(xyz=np.empty((0, 3)), rgb=np.empty((0, 3), np.uint8))

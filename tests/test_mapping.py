@@ -17,7 +17,7 @@ from scenes import CAMERA, make_piece, points_ahead, rotation_about_y, walk
 from smust3r_colmap.backbones.classical import backbone as backbone_module
 from smust3r_colmap.backbones.classical import calibration
 from smust3r_colmap.backbones.classical import features as features_module
-from smust3r_colmap.backbones.classical.backbone import ClassicalBackbone, _RunFeatures
+from smust3r_colmap.backbones.classical.backbone import ClassicalBackbone
 from smust3r_colmap.backbones.classical.calibration import (
     CalibrationTask,
     agree_on_cameras,
@@ -50,7 +50,7 @@ from smust3r_colmap.errors import StorageError
 from smust3r_colmap.execution import TaskFailure, TaskResult, map_tasks
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import Sim3
-from smust3r_colmap.products import ImageCollection, Segment, SourceImage, Tracks
+from smust3r_colmap.products import ImageCollection, RunFeatures, Segment, SourceImage, Tracks
 from smust3r_colmap.progress import QuietReporter
 from smust3r_colmap.run_directory import RunDirectory
 from smust3r_colmap.statistics import weighted_median
@@ -467,7 +467,7 @@ def backbone_of(task: MappingTask, run: RunDirectory) -> ClassicalBackbone:
         images=tuple(replace(image, name=str(k)) for k in range(NUM_IMAGES)), cameras=(CAMERA,)
     )
     backbone = ClassicalBackbone(collection, ClassicalConfig(), run, QuietReporter(sys.stderr), workers=1, seed=0)
-    backbone._features = _RunFeatures(database=task.database, key="features", usable=(True,) * NUM_IMAGES, rejected=())
+    backbone._features = RunFeatures(database=task.database, key="features", usable=(True,) * NUM_IMAGES, rejected=())
     return backbone
 
 

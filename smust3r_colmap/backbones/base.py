@@ -19,6 +19,7 @@ from smust3r_colmap.products import (
     FeatureLinks,
     ImageCollection,
     RejectedImage,
+    RunFeatures,
     Segment,
     SegmentPiece,
     SegmentReconstruction,
@@ -37,6 +38,7 @@ class BackboneResult:
         dense_key: hash of all that the maps were made from.
         links: verified matches, where the backbone has features.
         rejected: images that the backbone could not use at all.
+        features: where the backbone has SIFT features of all images.
     """
 
     reconstructions: tuple[SegmentReconstruction, ...]
@@ -44,6 +46,7 @@ class BackboneResult:
     dense_key: str
     links: FeatureLinks | None
     rejected: tuple[RejectedImage, ...]
+    features: RunFeatures | None = None
 
     def __post_init__(self) -> None:
         if len(self.dense) != len(self.pieces):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
@@ -18,14 +18,13 @@ from smust3r_colmap.backbones.classical.dense import DepthTask, make_depth
 from smust3r_colmap.backbones.classical.descriptors import FEATURES_PER_IMAGE, vlad_descriptors
 from smust3r_colmap.backbones.classical.features import (
     Pair,
-    create_database,
-    extract_features,
     match_pairs,
     open_database,
     plan_loop_pairs,
     plan_pairs,
 )
 from smust3r_colmap.backbones.classical.mapping import MappedSegment, MappingTask, map_segment
+from smust3r_colmap.backbones.classical.run_features import features_of_run
 from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
 from smust3r_colmap.config import ClassicalConfig
 from smust3r_colmap.execution import TaskFailure, map_tasks
@@ -34,7 +33,7 @@ from smust3r_colmap.products import (
     DenseMaps,
     FeatureLinks,
     ImageCollection,
-    RejectedImage,
+    RunFeatures,
     Segment,
     SegmentPiece,
     SegmentReconstruction,
@@ -47,16 +46,6 @@ from smust3r_colmap.stored_maps import EmptyMaps, StoredMaps
 logger = logging.getLogger(__name__)
 
 TaskT = TypeVar("TaskT")
-
-
-@dataclass(frozen=True, kw_only=True)
-class _RunFeatures:
-    """The run's database; which images have features, and why the others have none."""
-
-    database: Path
-    key: str
-    usable: tuple[bool, ...]
-    rejected: tuple[RejectedImage, ...]
 
 
 class ClassicalBackbone:
@@ -121,32 +110,15 @@ class ClassicalBackbone:
             dense_key=dense_key,
             links=_read_links(self._features.database, sorted(set().union(*pairs.values()))),
             rejected=self._features.rejected,
+            features=self._features,
         )
 
     # ------------------------------------------------------------- once in the run
     @cached_property
-    def _features(self) -> _RunFeatures:
-        """Extract what no earlier start extracted."""
-        images = [(image.digest, image.width, image.height, image.camera) for image in self.collection.images]
-        settings = (self.config.max_image_size, self.config.max_features, self.seed)
-        stored = self.run.stage("features", key=key_of("features", images, self.collection.cameras, *settings))
-        database = stored.open_in_place() / "database.db"
-        create_database(database, self.collection)
-        with self.reporter.stage("features", total=len(self.collection)) as stage:
-            rejected = extract_features(
-                database,
-                self.collection,
-                max_image_size=self.config.max_image_size,
-                max_features=self.config.max_features,
-                workers=self.workers,
-                log_file=self.run.native_log,
-                stage=stage,
-            )
-        for image in rejected:
-            self.reporter.warn(f"no features: {image.name} ({image.reason})")
-        lost = {image.name for image in rejected}
-        usable = tuple(image.name not in lost for image in self.collection.images)
-        return _RunFeatures(database=database, key=stored.key, usable=usable, rejected=rejected)
+    def _features(self) -> RunFeatures:
+        return features_of_run(
+            self.collection, self.config, self.run, self.reporter, workers=self.workers, seed=self.seed
+        )
 
     def _match(self, segments: Sequence[Segment]) -> dict[int, tuple[Pair, ...]]:
         """The matched pairs by segment. Pairs that failed are in no key, so what comes later is not final either."""
