@@ -1,0 +1,86 @@
+"""The database that goes with a model: COLMAP continues from both as if it had made them.
+
+Ids of cameras, rigs, frames and images are those of the model (index + 1), names are the real ones, and
+the keypoints of an image are the points2D of the model, row by row: the mapper refuses anything else.
+Images without a pose are in it, too, so that a continuation may register them. Descriptors are left out: they
+are ten times as large as all the rest, and every pair worth matching has been matched.
+The next module to read is ``trainer_folder``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.products import FloatArray, ImageCollection
+
+Pair = tuple[int, int]
+
+
+def write_colmap_database(
+    path: Path,
+    collection: ImageCollection,
+    cameras: Sequence[Intrinsics],
+    *,
+    keypoints: Mapping[int, npt.NDArray[np.float32]],
+    matches: Mapping[Pair, npt.NDArray[np.uint32]],
+    j_from_i: Mapping[Pair, FloatArray],
+    priors: Iterable[pycolmap.PosePrior],
+) -> None:
+    """Write a new database.
+
+    Args:
+        path: nothing must be there yet.
+        collection: all images, with a pose or without.
+        cameras: by camera index, as the model has them.
+        keypoints: by image index, (K, 2) in pixels of the original image; images may be left out.
+        matches: verified, by pair (i, j) of image indices.
+        j_from_i: (3, 4) relative poses of the pairs that have one, written with their essential matrices.
+        priors: of camera positions, with ids of the model.
+
+    Source: order of the calls as COLMAP 4 wants it (frames after images, images without a frame id).
+    """
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        write_cameras(database, cameras)
+        for index, image in enumerate(collection.images):
+            _write_image(database, index, image.name, image.camera)
+            points = keypoints.get(index, np.empty((0, 2), np.float32))
+            database.write_keypoints(index + 1, np.ascontiguousarray(points))
+        for (i, j), rows in matches.items():
+            database.write_matches(i + 1, j + 1, rows)
+            database.write_two_view_geometry(i + 1, j + 1, _two_view_geometry(rows, j_from_i.get((i, j))))
+        for prior in priors:
+            database.write_pose_prior(prior, use_pose_prior_id=True)
+
+
+def write_cameras(database: pycolmap.Database, cameras: Sequence[Intrinsics]) -> None:
+    """Each camera and the rig that consists of it; ids are index + 1."""
+    for index, intrinsics in enumerate(cameras):
+        camera = intrinsics.colmap_camera(index + 1)
+        database.write_camera(camera, use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=index + 1)
+        rig.add_ref_sensor(camera.sensor_id)
+        database.write_rig(rig, use_rig_id=True)
+
+
+def _write_image(database: pycolmap.Database, index: int, name: str, camera: int) -> None:
+    image = pycolmap.Image(name=name, camera_id=camera + 1, image_id=index + 1)
+    database.write_image(image, use_image_id=True)
+    frame = pycolmap.Frame(frame_id=index + 1, rig_id=camera + 1)
+    frame.add_data_id(image.data_id)
+    database.write_frame(frame, use_frame_id=True)
+
+
+def _two_view_geometry(matches: npt.NDArray[np.uint32], j_from_i: FloatArray | None) -> pycolmap.TwoViewGeometry:
+    geometry = pycolmap.TwoViewGeometry(
+        config=int(pycolmap.TwoViewGeometryConfiguration.CALIBRATED), inlier_matches=matches
+    )
+    if j_from_i is not None:
+        geometry.cam2_from_cam1 = pycolmap.Rigid3d(j_from_i)
+        geometry.E = pycolmap.essential_matrix_from_pose(geometry.cam2_from_cam1)
+    return geometry

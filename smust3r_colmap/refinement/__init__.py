@@ -1,0 +1,1 @@
+"""Real tracks, triangulation and bundle adjustment of a stitched model."""

@@ -1,0 +1,102 @@
+"""Where the optical axis meets the image: asked only where the model can answer.
+
+COLMAP keeps the principal point in the middle of the image, because a few images do not determine it. Many
+images from many sides do, and then a wrong one bends the whole model: freeing it took the cameras of a
+courtyard from 0.19 m to 0.03 m. So two halves of the points are asked separately, each with cameras of its
+own, and the answer counts where they agree. The next module to read is ``task``.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+
+from smust3r_colmap.products import FloatArray
+from smust3r_colmap.refinement.adjustment import Priors, adjust
+
+logger = logging.getLogger(__name__)
+
+MIN_IMAGES = 8
+"""Of each camera; fewer do not determine a principal point."""
+OBSERVATIONS, MIN_OBSERVATIONS_PER_IMAGE = 60_000, 150
+"""Of each half: as many as are quick to adjust, spread over the images, but of each image some."""
+MAX_SHIFT = 0.025
+"""As a part of the longer image side; real cameras stay within a percent or two."""
+AGREEMENT = 0.2
+"""Part of the shift by which the two halves may differ."""
+MAX_ITERATIONS = 30
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PrincipalPointAnswer:
+    """What the two halves said.
+
+    Args:
+        xy_img: by camera id, the mean of the two; empty where they were not asked.
+        reason: why the answer does not count, or empty.
+    """
+
+    xy_img: dict[int, FloatArray]
+    reason: str = ""
+
+
+def ask_for_principal_points(model: pycolmap.Reconstruction, priors: Priors, *, threads: int) -> PrincipalPointAnswer:
+    """Let two halves of the points of ``model``, which stays as it is, say where the principal points are."""
+    counts = dict.fromkeys(model.cameras, 0)
+    for image_id in model.reg_image_ids():
+        counts[model.image(image_id).camera_id] += 1
+    used = [camera_id for camera_id, count in counts.items() if count]
+    poor = [camera_id for camera_id in used if counts[camera_id] < MIN_IMAGES]
+    if poor:
+        return PrincipalPointAnswer(xy_img={}, reason=f"camera {poor[0]} has {counts[poor[0]]} of {MIN_IMAGES} images")
+    halves = []
+    for half in (0, 1):
+        part = _part_of(model, half)
+        if not adjust(
+            part, priors, calibrated=False, principal_point=True, max_iterations=MAX_ITERATIONS, threads=threads
+        ):
+            return PrincipalPointAnswer(xy_img={}, reason="half of the points gave no solution")
+        halves.append({camera_id: _principal_point(part.camera(camera_id)) for camera_id in used})
+    answer = {camera_id: (halves[0][camera_id] + halves[1][camera_id]) / 2 for camera_id in used}
+    for camera_id in used:
+        reason = _why_not(model.camera(camera_id), halves[0][camera_id], halves[1][camera_id])
+        if reason:
+            return PrincipalPointAnswer(xy_img=answer, reason=reason)
+    return PrincipalPointAnswer(xy_img=answer)
+
+
+def _why_not(camera: pycolmap.Camera, first: FloatArray, second: FloatArray) -> str:
+    longer = max(camera.width, camera.height)
+    shift = float(np.linalg.norm((first + second) / 2 - _principal_point(camera)))
+    apart = float(np.linalg.norm(first - second))
+    logger.info("camera %d: principal point %s and %s", camera.camera_id, first.round(2), second.round(2))
+    if not np.isfinite(shift + apart) or shift > MAX_SHIFT * longer:
+        return f"the principal point of camera {camera.camera_id} would move by {shift:.1f} px"
+    if apart > AGREEMENT * shift:
+        return f"two halves of the points put it {apart:.1f} px apart, for a shift of {shift:.1f} px"
+    return ""
+
+
+def _principal_point(camera: pycolmap.Camera) -> FloatArray:
+    return np.array([camera.principal_point_x, camera.principal_point_y])
+
+
+def _part_of(model: pycolmap.Reconstruction, half: int) -> pycolmap.Reconstruction:
+    """A copy with every other point, the longest tracks first, until each image has enough."""
+    part = pycolmap.Reconstruction(model)
+    points = sorted(model.points3D.items(), key=lambda item: (-item[1].track.length(), item[0]))
+    enough = max(OBSERVATIONS // model.num_reg_images(), MIN_OBSERVATIONS_PER_IMAGE)
+    seen: dict[int, int] = {}
+    chosen = set()
+    for point_id, point in points[half::2]:
+        images = [element.image_id for element in point.track.elements]
+        if any(seen.get(image_id, 0) < enough for image_id in images):
+            chosen.add(point_id)
+            for image_id in images:
+                seen[image_id] = seen.get(image_id, 0) + 1
+    for point_id in model.point3D_ids() - chosen:
+        part.delete_point3D(point_id)
+    return part

@@ -1,0 +1,616 @@
+"""From stitched scenes and matches to adjusted models with tracks: the work of one child process.
+
+    loose    matches that the stitched geometry consents to, triangulation with poses fixed, adjustment
+             (large models part by part first)
+    tight    the same again from the adjusted geometry: consent is worth more now, tracks grow longer, images
+             without a pose are placed
+    finish   filters, a last adjustment, colours
+
+pycolmap does the work; every adjustment is judged by ``steps`` and undone where it made things worse.
+The next module to read is ``refine``.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from smust3r_colmap.exporters.colmap_database import write_colmap_database
+from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.importers.images import load_grey, load_rgb
+from smust3r_colmap.products import DepthMaps, FloatArray, ImageCollection, Scene
+from smust3r_colmap.refinement.adjustment import (
+    FUNCTION_TOLERANCE,
+    MANY_OBSERVATIONS,
+    MIN_ANGLE_DEG,
+    ROUGH_TOLERANCE,
+    ModelFigures,
+    Priors,
+    Tolerance,
+    adjust,
+    adjust_part,
+    figures_of,
+    pose_priors,
+    priors_of,
+    triangulate,
+    triangulator_options,
+    weak_images,
+)
+from smust3r_colmap.refinement.completion import complete_model
+from smust3r_colmap.refinement.correspondences import Correspondences, Pair, joined
+from smust3r_colmap.refinement.feature_matches import (
+    MIN_VERIFIED,
+    Consent,
+    MatchedFeatures,
+    View,
+    ask_consent,
+    read_matched_features,
+)
+from smust3r_colmap.refinement.pointmap_matches import MappedView, match_by_pointmaps
+from smust3r_colmap.refinement.principal_point import ask_for_principal_points
+from smust3r_colmap.refinement.steps import MAX_ERROR_PX, StepReport, tried_step
+from smust3r_colmap.run_directory import StageFolder, write_json
+
+logger = logging.getLogger(__name__)
+
+LOOSE_PART = 0.012
+"""Epipolar and reprojection tolerance of the first round, as a part of the longer image side: what stitching leaves."""
+TIGHT_PART = 0.004
+"""Of the second round, when the cameras have been adjusted once."""
+LOOSE_ANGLE_DEG, TIGHT_ANGLE_DEG = 4.0, 2.0
+FIRST_FILTER_PX = 8.0
+FIRST_ITERATIONS, SECOND_ITERATIONS, LAST_ITERATIONS, PART_ITERATIONS = 12, 30, 10, 6
+"""Upper bounds; after so many the figures stand still to three digits on the sets tried."""
+MAP_KEYPOINTS = 1000
+"""Corners of an image that are followed by pointmaps."""
+MIN_SEEN_POINTS, MIN_AGREEING_PART = 12, 0.6
+"""Points that place an image without a pose, and the part of its verified matches that must agree with the place."""
+MAX_LAST_ROUNDS, STILL_PERCENT = 4, 0.05
+"""Filter and adjust again until no camera moves by more than this part of the path's extent: an image that wrong
+matches hold lets go of them one by one."""
+LARGE = 250
+"""Images beyond which parts are adjusted before the whole."""
+MODEL_FOLDER, DATABASE_FILE = "model", "database.db"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RefineTask:
+    """All scenes of a run, to be refined one after the other.
+
+    Args:
+        stored: the stage that gets ``0/model``, ``1/model`` ..., ``database.db`` and ``figures.json``.
+        collection: all images.
+        scenes: stitched; their points are not used.
+        features: the run's database of SIFT features and matches, or None.
+        maps: depth by image name, to match by pointmaps, or None.
+        map_pairs: image pairs to match by pointmaps.
+        parts: image indices of the segments, for large models.
+        calibrated: intrinsics stay.
+        threads: of pycolmap.
+        tolerance: epipolar and reprojection tolerance of the first round, as a part of the longer image side.
+        principal_point: let the principal points move where the model determines them.
+        complete: let COLMAP's mapper try the images that have no pose in the end, on the largest model.
+    """
+
+    stored: StageFolder
+    collection: ImageCollection
+    scenes: tuple[Scene, ...]
+    features: Path | None
+    maps: DepthMaps | None
+    map_pairs: tuple[Pair, ...]
+    parts: tuple[tuple[int, ...], ...]
+    calibrated: bool
+    threads: int
+    tolerance: float = LOOSE_PART
+    principal_point: bool = True
+    complete: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefinedFigures:
+    """What became of one scene.
+
+    Args:
+        steps: in order, also those that were undone.
+        num_pairs, num_matches: that the geometry consented to in the end.
+        num_refused_pairs: verified pairs that contradict the geometry.
+        weak: image indices with too few observations, which keep their stitched place among their neighbours.
+        registered: image indices that the stitched scene did not have.
+        final: figures of the model as it is stored.
+        kept: the refined model stands; False where it came out worse than the stitched one.
+        reason: why not, or empty.
+    """
+
+    steps: tuple[StepReport, ...]
+    num_pairs: int
+    num_matches: int
+    num_refused_pairs: int
+    weak: tuple[int, ...]
+    registered: tuple[int, ...]
+    final: ModelFigures
+    kept: bool
+    reason: str = ""
+
+
+def refine_scenes(task: RefineTask) -> tuple[RefinedFigures, ...]:
+    """Refine all scenes and store their models, the common database and the figures; see ``RefineTask``."""
+    features = _gathered(task)
+    with task.stored.write() as folder:
+        outcomes = [_refine_scene(task, scene, features, folder) for scene in task.scenes]
+        if task.complete and outcomes[0].figures.kept:
+            outcomes[0] = _completed(task, features, outcomes, folder)
+        for number, outcome in enumerate(outcomes):
+            model_folder = folder / str(number) / MODEL_FOLDER
+            model_folder.mkdir(parents=True)
+            outcome.model.write_binary(model_folder)
+        _write_database(task, features, outcomes, folder / DATABASE_FILE)
+        figures = tuple(outcome.figures for outcome in outcomes)
+        write_json(folder / "figures.json", figures)
+    return figures
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Outcome:
+    model: pycolmap.Reconstruction
+    consent: Consent
+    priors: Priors
+    figures: RefinedFigures
+
+
+def _gathered(task: RefineTask) -> MatchedFeatures:
+    """Features and pointmap correspondences as one; the latter are taken for verified."""
+    everything = range(len(task.collection))
+    if task.features is None:
+        found = MatchedFeatures(keypoints={i: np.empty((0, 2), np.float32) for i in everything}, raw={}, verified={})
+    else:
+        found = read_matched_features(task.features, everything)
+    if task.maps is None:
+        return found
+    for scene in task.scenes:
+        pointmaps = _matched_by_pointmaps(task.collection, scene, task.maps, task.map_pairs)
+        raw = joined(Correspondences(keypoints=found.keypoints, matches=found.raw), pointmaps)
+        verified = joined(Correspondences(keypoints=found.keypoints, matches=found.verified), pointmaps)
+        found = MatchedFeatures(keypoints=raw.keypoints, raw=raw.matches, verified=verified.matches)
+    return found
+
+
+def _matched_by_pointmaps(
+    collection: ImageCollection, scene: Scene, maps: DepthMaps, pairs: Sequence[Pair]
+) -> Correspondences:
+    views = [
+        MappedView(
+            index=index,
+            cam_from_world=pose,
+            intrinsics=scene.cameras[camera],
+            depth=partial(maps.depth, name),
+            confidence=partial(maps.confidence, name),
+            grey=partial(load_grey, collection.images[index]),
+        )
+        for index, name, camera, pose in zip(
+            scene.image_indices, scene.image_names, scene.camera_indices, scene.cam_from_world, strict=True
+        )
+        if name in maps
+    ]
+    there = {view.index for view in views}
+    chosen = [pair for pair in pairs if pair[0] in there and pair[1] in there]
+    return match_by_pointmaps(views, chosen, max_keypoints=MAP_KEYPOINTS)
+
+
+# ------------------------------------------------------------------------- one scene
+def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scratch: Path) -> _Outcome:
+    cameras = tuple(scene.cameras.get(i, prior) for i, prior in enumerate(task.collection.cameras))
+    of_scene = _without_images_of_other_scenes(features, scene, task.scenes)
+    stitched = dict(zip(scene.image_indices, scene.cam_from_world, strict=True))
+    consent = ask_consent(of_scene, _views(stitched, cameras, task.collection), tolerance=task.tolerance)
+    bench = _Bench(task, cameras, consent, stitched, scratch)
+    priors = priors_of(bench.model)
+    steps = [_triangulation(bench, Tolerance(pixels=task.tolerance * _longer_side(task), angle_deg=LOOSE_ANGLE_DEG))]
+    if not bench.model.num_points3D():
+        return _nothing_to_adjust(task, bench, consent, priors, steps)
+    if len(scene) > LARGE:
+        steps.append(tried_step("adjustment of parts", bench.model, lambda: _adjust_parts(bench.model, task)))
+    steps.append(_adjustment("adjustment", bench.model, priors, task, FIRST_ITERATIONS, rough=True))
+    bench.filter(FIRST_FILTER_PX)
+
+    tight = Tolerance(pixels=TIGHT_PART * _longer_side(task), angle_deg=TIGHT_ANGLE_DEG)
+    poses, cameras = _poses(bench.model), _cameras(bench.model, cameras)
+    consent = ask_consent(of_scene, _views(poses, cameras, task.collection), tolerance=TIGHT_PART)
+    bench = bench.with_matches(consent)
+    registered = bench.register_missing(of_scene, tight)
+    steps.append(_triangulation(bench, tight, name="longer tracks"))
+    _drop_needless_pairs(bench)
+    steps.append(_adjustment("second adjustment", bench.model, priors, task, SECOND_ITERATIONS, rough=True))
+    bench.filter(MAX_ERROR_PX)
+    free = not task.calibrated and _is_principal_point_determined(bench.model, priors, task)
+    if free:
+        steps.append(_adjustment("principal point", bench.model, priors, task, SECOND_ITERATIONS, principal_point=True))
+        bench.filter(MAX_ERROR_PX)
+    for _ in range(MAX_LAST_ROUNDS):
+        bench.complete(tight)
+        _drop_needless_pairs(bench)
+        last = _adjustment("last adjustment", bench.model, priors, task, LAST_ITERATIONS, principal_point=free)
+        steps.append(last)
+        bench.filter(min(MAX_ERROR_PX, tight.pixels))
+        if last.max_moved_percent < STILL_PERCENT or not last.kept:
+            break
+    return _finished(task, bench, consent, priors, stitched, steps, registered)
+
+
+class _Bench:
+    """pycolmap's mapper on the matches that have consent; the objects that it needs live as long as it does."""
+
+    def __init__(
+        self,
+        task: RefineTask,
+        cameras: Sequence[Intrinsics],
+        consent: Consent,
+        cam_from_world: Mapping[int, FloatArray],
+        scratch: Path,
+        model: pycolmap.Reconstruction | None = None,
+    ) -> None:
+        self.task, self.scratch = task, scratch
+        with tempfile.TemporaryDirectory(dir=scratch) as folder:
+            path = Path(folder) / DATABASE_FILE
+            write_colmap_database(
+                path,
+                task.collection,
+                cameras,
+                keypoints=consent.correspondences.keypoints,
+                matches=consent.correspondences.matches,
+                j_from_i={},
+                priors=(),
+            )
+            with pycolmap.Database.open(path) as database:
+                self._cache = pycolmap.DatabaseCache.create(
+                    database, pycolmap.DatabaseCacheOptions(min_num_matches=1, load_all_images=True)
+                )
+        if model is None:
+            model = pycolmap.Reconstruction()
+            model.load(self._cache)
+            for index, pose in cam_from_world.items():
+                model.frame(index + 1).rig_from_world = pycolmap.Rigid3d(pose)
+                model.register_frame(index + 1)
+        self.model = model
+        self.mapper = pycolmap.IncrementalMapper(self._cache)
+        self.mapper.begin_reconstruction(model)
+
+    def with_matches(self, consent: Consent) -> _Bench:
+        """The same model with other matches."""
+        self.mapper.end_reconstruction(False)
+        cameras = _cameras(self.model, self.task.collection.cameras)
+        return _Bench(self.task, cameras, consent, {}, self.scratch, self.model)
+
+    def filter(self, pixels: float) -> None:
+        """Leave out observations that are too far off and points that are seen under no angle."""
+        self.mapper.observation_manager.filter_all_points3D(pixels, MIN_ANGLE_DEG)
+
+    def complete(self, tolerance: Tolerance) -> None:
+        """Longer tracks."""
+        self.mapper.complete_and_merge_tracks(triangulator_options(tolerance))
+
+    def register_missing(self, features: MatchedFeatures, tolerance: Tolerance) -> tuple[int, ...]:
+        """Place images that have no pose by the points they see; returns their indices.
+
+        Fewer points than COLMAP asks for are enough, because most of the image's matches must agree afterwards.
+        """
+        options = pycolmap.IncrementalMapperOptions()
+        options.random_seed = 0
+        options.num_threads = self.task.threads
+        options.abs_pose_min_num_inliers = MIN_SEEN_POINTS
+        options.abs_pose_refine_focal_length = options.abs_pose_refine_extra_params = False
+        found: list[int] = []
+        while True:
+            candidates = self.mapper.find_next_images(options, False)
+            new = [i for i in candidates if self._register(options, features, i)]
+            for image_id in new:
+                self.mapper.triangulate_image(triangulator_options(tolerance), image_id)
+            found += new
+            if not new:
+                return tuple(sorted(i - 1 for i in found))
+
+    def _register(self, options: pycolmap.IncrementalMapperOptions, features: MatchedFeatures, image_id: int) -> bool:
+        if not self.mapper.register_next_image(options, image_id):
+            return False
+        if _agrees(self.task, features, self.model, image_id):
+            return True
+        self.mapper.observation_manager.deregister_frame(self.model.image(image_id).frame_id)
+        return False
+
+
+def _agrees(task: RefineTask, features: MatchedFeatures, model: pycolmap.Reconstruction, image_id: int) -> bool:
+    """Most verified matches of the image with others that have a pose lie on their epipolar lines."""
+    poses = _poses(model)
+    around = {
+        pair: rows for pair, rows in features.verified.items() if image_id - 1 in pair and all(i in poses for i in pair)
+    }
+    near = {i: poses[i] for pair in around for i in pair}
+    views = _views(near, _cameras(model, task.collection.cameras), task.collection)
+    consent = ask_consent(replace(features, raw=around, verified=around), views, tolerance=LOOSE_PART)
+    return consent.correspondences.num_matches >= MIN_AGREEING_PART * max(sum(map(len, around.values())), 1)
+
+
+def _triangulation(bench: _Bench, tolerance: Tolerance, *, name: str = "triangulation") -> StepReport:
+    before = figures_of(bench.model)
+    triangulate(bench.mapper, tolerance)
+    return StepReport(
+        name=name,
+        before=before,
+        after=figures_of(bench.model),
+        moved_percent=0.0,
+        max_moved_percent=0.0,
+        turned_deg=0.0,
+        kept=True,
+    )
+
+
+def _adjustment(
+    name: str,
+    model: pycolmap.Reconstruction,
+    priors: Priors,
+    task: RefineTask,
+    max_iterations: int,
+    *,
+    principal_point: bool = False,
+    rough: bool = False,
+) -> StepReport:
+    def step() -> bool:
+        return adjust(
+            model,
+            priors,
+            calibrated=task.calibrated,
+            max_iterations=max_iterations,
+            threads=task.threads,
+            principal_point=principal_point,
+            function_tolerance=ROUGH_TOLERANCE if rough else FUNCTION_TOLERANCE,
+        )
+
+    return tried_step(name, model, step)
+
+
+def _is_principal_point_determined(model: pycolmap.Reconstruction, priors: Priors, task: RefineTask) -> bool:
+    """Whether the model determines them, which the log says why."""
+    if not task.principal_point:
+        return False
+    answer = ask_for_principal_points(model, priors, threads=task.threads)
+    logger.info("principal point: %s", answer.reason or "free")
+    return not answer.reason
+
+
+def _adjust_parts(model: pycolmap.Reconstruction, task: RefineTask) -> bool:
+    registered = set(model.reg_image_ids())
+    parts = [[i + 1 for i in part if i + 1 in registered] for part in task.parts]
+    return all(adjust_part(model, part, max_iterations=PART_ITERATIONS, threads=task.threads) for part in parts if part)
+
+
+def _nothing_to_adjust(
+    task: RefineTask, bench: _Bench, consent: Consent, priors: Priors, steps: list[StepReport]
+) -> _Outcome:
+    reason = "no point could be triangulated: too few matches, or a camera that only turned"
+    figures = RefinedFigures(
+        steps=tuple(steps),
+        num_pairs=len(consent.correspondences.matches),
+        num_matches=consent.correspondences.num_matches,
+        num_refused_pairs=len(consent.refused),
+        weak=tuple(i - 1 for i in weak_images(bench.model)),
+        registered=(),
+        final=figures_of(bench.model),
+        kept=False,
+        reason=reason,
+    )
+    return _Outcome(model=bench.model, consent=consent, priors=priors, figures=figures)
+
+
+def _finished(
+    task: RefineTask,
+    bench: _Bench,
+    consent: Consent,
+    priors: Priors,
+    stitched: Mapping[int, FloatArray],
+    steps: list[StepReport],
+    registered: tuple[int, ...],
+) -> _Outcome:
+    model = bench.model
+    _put_back_weak_images(model, stitched)
+    bench.filter(MAX_ERROR_PX)  # from where it stands now, a weak image does not see all that it saw
+    _drop_needless_pairs(bench)
+    weak = weak_images(model)
+    some_sound = len(weak) < model.num_reg_images()
+    bench.mapper.end_reconstruction(False)
+    _colour(model, task.collection)
+    figures = RefinedFigures(
+        steps=tuple(steps),
+        num_pairs=len(consent.correspondences.matches),
+        num_matches=consent.correspondences.num_matches,
+        num_refused_pairs=len(consent.refused),
+        weak=tuple(i - 1 for i in weak),
+        registered=tuple(i for i in registered if i + 1 in model.reg_image_ids()),
+        final=figures_of(model),
+        kept=some_sound,
+        reason="" if some_sound else "no image sees enough points to be adjusted by",
+    )
+    return _Outcome(model=model, consent=consent, priors=priors, figures=figures)
+
+
+def _completed(task: RefineTask, features: MatchedFeatures, outcomes: Sequence[_Outcome], scratch: Path) -> _Outcome:
+    """The largest model with those of the images that no model has which COLMAP's mapper can add."""
+    largest = outcomes[0]
+    placed = {i for outcome in outcomes for i in _poses(outcome.model)}
+    if len(placed) == len(task.collection):
+        return largest
+    with tempfile.TemporaryDirectory(dir=scratch) as folder:
+        database = Path(folder) / DATABASE_FILE
+        write_colmap_database(
+            database,
+            task.collection,
+            _cameras(largest.model, task.collection.cameras),
+            keypoints=largest.consent.correspondences.keypoints,
+            matches=largest.consent.correspondences.matches,
+            j_from_i={},
+            priors=(),
+        )
+        completion = complete_model(
+            largest.model,
+            database,
+            agrees=lambda model, image_id: _agrees(task, features, model, image_id),
+            scratch=scratch,
+            threads=task.threads,
+        )
+    steps = (*largest.figures.steps, completion.report)
+    if not completion.registered:
+        return replace(largest, figures=replace(largest.figures, steps=steps))
+    _colour(completion.model, task.collection)
+    registered = sorted({*largest.figures.registered, *(i - 1 for i in completion.registered)})
+    still_weak = set(weak_images(completion.model))
+    figures = replace(
+        largest.figures,
+        steps=steps,
+        registered=tuple(registered),
+        weak=tuple(i for i in largest.figures.weak if i + 1 in still_weak),
+        final=completion.report.after,
+    )
+    return replace(largest, model=completion.model, figures=figures)
+
+
+def _drop_needless_pairs(bench: _Bench) -> None:
+    """Remove points that two images see only, where both have enough others.
+
+    Two rays meet wherever the epipolar lines allow, so wrong matches of a repetitive facade look as good as right
+    ones and hold an image where it does not belong.
+    """
+    model = bench.model
+    longer = dict.fromkeys(model.reg_image_ids(), 0)
+    short = []
+    for point_id, point in model.points3D.items():
+        images = {element.image_id for element in point.track.elements}
+        if len(images) > 2:
+            for image_id in images:
+                longer[image_id] += 1
+        else:
+            short.append((point_id, images))
+    for point_id, images in short:
+        if len(images) < 2 or all(longer[i] >= MANY_OBSERVATIONS for i in images):
+            bench.mapper.observation_manager.delete_point3D(point_id)
+
+
+def _put_back_weak_images(model: pycolmap.Reconstruction, stitched: Mapping[int, FloatArray]) -> None:
+    """Images that rest on too little go where their stitched pose is, seen from the nearest sound image.
+
+    The adjustment may have moved the neighbourhood; the stitched pose moves along with it. An image that had no
+    stitched pose is given up again.
+    """
+    weak = weak_images(model)
+    sound = sorted(set(model.reg_image_ids()) - set(weak))
+    anchors = [i for i in sound if i - 1 in stitched]
+    for image_id in weak:
+        if image_id - 1 not in stitched:
+            model.deregister_frame(model.image(image_id).frame_id)
+        elif anchors:
+            near = min(anchors, key=lambda i: abs(i - image_id))
+            near_from_world = model.image(near).cam_from_world()
+            old_near, old = pycolmap.Rigid3d(stitched[near - 1]), pycolmap.Rigid3d(stitched[image_id - 1])
+            model.frame(model.image(image_id).frame_id).rig_from_world = old * old_near.inverse() * near_from_world
+
+
+def _colour(model: pycolmap.Reconstruction, collection: ImageCollection) -> None:
+    """The mean colour of each point's observations, read from the upright images."""
+    sums: dict[int, FloatArray] = {}
+    counts: dict[int, int] = {}
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.image(image_id)
+        seen = [(point.point3D_id, point.xy) for point in image.points2D if point.has_point3D()]
+        if not seen:
+            continue
+        rgb = load_rgb(collection.images[image_id - 1])
+        xy = np.array([place for _, place in seen])
+        column = np.clip(xy[:, 0].astype(np.int64), 0, rgb.shape[1] - 1)
+        row = np.clip(xy[:, 1].astype(np.int64), 0, rgb.shape[0] - 1)
+        for (point_id, _), colour in zip(seen, rgb[row, column].astype(np.float64), strict=True):
+            sums[point_id] = sums.get(point_id, 0.0) + colour
+            counts[point_id] = counts.get(point_id, 0) + 1
+    for point_id, total in sums.items():
+        model.point3D(point_id).color = np.round(total / counts[point_id]).astype(np.uint8)
+
+
+# ------------------------------------------------------------------------- helpers
+def _views(
+    poses: Mapping[int, FloatArray], cameras: Sequence[Intrinsics], collection: ImageCollection
+) -> dict[int, View]:
+    return {i: View(cam_from_world=pose, intrinsics=cameras[collection.images[i].camera]) for i, pose in poses.items()}
+
+
+def _poses(model: pycolmap.Reconstruction) -> dict[int, FloatArray]:
+    return {i - 1: model.image(i).cam_from_world().matrix() for i in sorted(model.reg_image_ids())}
+
+
+def _cameras(model: pycolmap.Reconstruction, priors: Sequence[Intrinsics]) -> tuple[Intrinsics, ...]:
+    return tuple(
+        Intrinsics.from_colmap(model.camera(index + 1)) if index + 1 in model.cameras else prior
+        for index, prior in enumerate(priors)
+    )
+
+
+def _adjusted_cameras(model: pycolmap.Reconstruction, priors: Sequence[Intrinsics]) -> tuple[Intrinsics, ...]:
+    """As ``_cameras``; a focal length that images have adjusted is a good prior, and global mapping asks for one."""
+    used = {model.image(i).camera_id - 1 for i in model.reg_image_ids()}
+    cameras = _cameras(model, priors)
+    return tuple(replace(one, has_prior_focal=one.has_prior_focal or k in used) for k, one in enumerate(cameras))
+
+
+def _longer_side(task: RefineTask) -> int:
+    return int(np.median([max(image.width, image.height) for image in task.collection.images]))
+
+
+def _without_images_of_other_scenes(
+    features: MatchedFeatures, scene: Scene, scenes: Iterable[Scene]
+) -> MatchedFeatures:
+    """Images that another scene holds are not to be placed in this one, too."""
+    elsewhere = {i for other in scenes if other is not scene for i in other.image_indices} - set(scene.image_indices)
+
+    def kept(matches: Mapping[Pair, npt.NDArray[np.uint32]]) -> dict[Pair, npt.NDArray[np.uint32]]:
+        return {pair: rows for pair, rows in matches.items() if not elsewhere & set(pair)}
+
+    return replace(features, raw=kept(features.raw), verified=kept(features.verified))
+
+
+def _write_database(task: RefineTask, features: MatchedFeatures, outcomes: Sequence[_Outcome], path: Path) -> None:
+    """All images; per scene the matches it consents to, between scenes and images without a pose the verified ones."""
+    scene_of = {i: number for number, outcome in enumerate(outcomes) for i in _poses(outcome.model)}
+    matches = {
+        pair: rows
+        for pair, rows in features.verified.items()
+        if len(rows) >= MIN_VERIFIED and scene_of.get(pair[0], -1) != scene_of.get(pair[1], -2)
+    }
+    j_from_i: dict[Pair, FloatArray] = {}
+    for outcome in reversed(outcomes):
+        poses = _poses(outcome.model)
+        within = {
+            pair: rows
+            for pair, rows in outcome.consent.correspondences.matches.items()
+            if pair[0] in poses and pair[1] in poses
+        }
+        matches |= within
+        j_from_i |= {(i, j): _compose(poses[j], invert_rigid(poses[i])) for i, j in within}
+    largest = outcomes[0]
+    write_colmap_database(
+        path,
+        task.collection,
+        _adjusted_cameras(largest.model, task.collection.cameras),
+        keypoints=features.keypoints,
+        matches=dict(sorted(matches.items())),
+        j_from_i=j_from_i,
+        priors=pose_priors(largest.model, largest.priors),
+    )
+
+
+def _compose(c_from_b: FloatArray, b_from_a: FloatArray) -> FloatArray:
+    rotation = c_from_b[:, :3] @ b_from_a[:, :3]
+    return np.column_stack([rotation, c_from_b[:, :3] @ b_from_a[:, 3] + c_from_b[:, 3]])
