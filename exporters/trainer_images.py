@@ -1,0 +1,260 @@
+"""The pixels of a trainer folder: undistorted images and masks, and smaller copies of them.
+
+A file that is as trainers want it already (a JPEG or PNG of a centred pinhole, 8-bit RGB, upright) is copied byte
+by byte; everything else is decoded, resampled once and encoded again. JPEG stays JPEG and all other formats become
+PNG. Grey images become RGB: gsplat and the original 3D Gaussian Splatting expect three channels.
+The next module to read is ``inverse_depth``.
+"""
+
+from __future__ import annotations
+
+import shutil
+import struct
+import warnings
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from itertools import groupby
+from pathlib import Path, PurePosixPath
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from PIL import ExifTags, Image, UnidentifiedImageError
+
+from smust3r_colmap.errors import ImageError, InputError
+from smust3r_colmap.execution import usable_cores
+from smust3r_colmap.exporters.centred_pinhole import CentredPinhole, resampled
+from smust3r_colmap.importers.images import load_rgb
+from smust3r_colmap.products import SourceImage
+
+UInt8Array = npt.NDArray[np.uint8]
+
+JPEG_PARAMS = (
+    *(cv2.IMWRITE_JPEG_QUALITY, 97),
+    *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
+)
+"""Little more is lost than the original JPEG has lost already, and colour keeps its full resolution."""
+PNG_PARAMS = (cv2.IMWRITE_PNG_COMPRESSION, 3)
+"""Twice as fast as the usual 6, for files some percent larger."""
+MAX_THREADS = 8
+"""Every thread holds an image, its lookup and the result: 0.4 GB at 24 megapixels."""
+IMAGES_PER_LOOKUP = 16
+"""Images that one thread takes at a time; they share the lookup of their camera."""
+
+_Lookup = npt.NDArray[np.float32] | None
+_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
+_TURNED_SIDEWAYS = (5, 6, 7, 8)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainerImage:
+    """One image on its way into the folder.
+
+    Args:
+        source: the file; its size is the camera's.
+        suffix: of the new file, ``.jpg`` or ``.png``.
+        camera: of the file, and the pinhole that stands for it.
+        verbatim: the file is copied as it is.
+    """
+
+    source: SourceImage
+    suffix: str
+    camera: CentredPinhole
+    verbatim: bool
+
+
+# ----------------------------------------------------------------------------- looking
+def look_at_image(images: Path, name: str, camera: CentredPinhole) -> TrainerImage:
+    """Read the head of an image file and compare it with its camera.
+
+    Raises:
+        ImageError: there is no such file, it is no image, or it has another size than the camera.
+    """
+    path = images / name
+    width, height = camera.original.width, camera.original.height
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # Orthophotos are that large.
+            with Image.open(path, formats=_FORMATS) as head:
+                kind, size, mode = head.format, head.size, head.mode
+                turn = _orientation(head)
+        with path.open("rb") as file:
+            bit_depth = file.read(25)[24]  # PNG 11.2.1: signature 8, chunk head 8, width 4, height 4, bit depth.
+    except FileNotFoundError as error:
+        raise ImageError(f"{name}: there is no such file in {images}; give the folder the model was made of") from error
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, IndexError) as error:
+        raise ImageError(f"{name}: cannot be read as JPEG, PNG, WebP or TIFF ({error})") from error
+    sideways = turn in _TURNED_SIDEWAYS
+    upright = size[::-1] if sideways else size
+    if upright != (width, height):
+        turned = f" (stored as {size[0]}x{size[1]}, turned by its EXIF orientation)" if sideways else ""
+        raise ImageError(
+            f"{name}: the file is {upright[0]}x{upright[1]} px{turned} and its camera {width}x{height};"
+            " give the images that the model was made of"
+        )
+    plain = kind == "JPEG" or (kind == "PNG" and bit_depth == 8)
+    return TrainerImage(
+        source=SourceImage(name=name, path=path, width=width, height=height, camera=0, digest=""),
+        suffix=".jpg" if kind in ("JPEG", "MPO") else ".png",  # MPO: JPEG of phones with a second image behind
+        camera=camera,
+        verbatim=plain and mode == "RGB" and turn in (0, 1) and camera.is_identity,
+    )
+
+
+def _orientation(head: Image.Image) -> int:
+    """EXIF orientation as ``load_rgb`` applies it: TIFF comes upright from Pillow, and broken EXIF says nothing."""
+    if head.format == "TIFF":
+        return 1
+    try:
+        return int(head.getexif().get(ExifTags.Base.Orientation, 1))
+    except (OSError, SyntaxError, ValueError, TypeError, KeyError, struct.error):
+        return 1
+
+
+def find_mask(masks: Path, image: TrainerImage) -> Path | None:
+    """COLMAP's rule: ``<name>.png``, else ``<name without suffix>.png``, below the folder of masks."""
+    name = PurePosixPath(image.source.name)
+    candidates = (masks / f"{name}.png", masks / name.with_suffix(".png"))
+    return next((path for path in candidates if path.is_file()), None)
+
+
+# ----------------------------------------------------------------------------- writing
+def write_images(images: Sequence[tuple[TrainerImage, str]], folder: Path, scales: Sequence[int]) -> None:
+    """Write ``images/<new name>`` and, for each scale, ``images_<scale>/<new name>`` below ``folder``.
+
+    Smaller copies are means over areas; width and height are divided and rounded down, as nerfstudio expects.
+
+    Args:
+        images: each with its new name.
+        folder: exists.
+        scales: such as (2, 4).
+
+    Raises:
+        ImageError: a file no longer decodes.
+        OSError: the disk refused.
+    """
+    _make_folders(folder, "images", scales)
+    _each_camera_at_once(images, partial(_write_image, folder, scales))
+
+
+def write_masks(
+    images: Sequence[tuple[TrainerImage, str]], masks: Path, folder: Path, scales: Sequence[int]
+) -> tuple[str, ...]:
+    """Write the masks below ``folder`` in both naming rules, for nerfstudio and Brush, and for COLMAP.
+
+    ``masks/<new stem>.png`` and ``masks/<new name>.png`` are the same; white is kept. What is not black in the
+    original is kept, as in COLMAP. An image without a mask gets a white one: nerfstudio wants all or none.
+
+    Returns:
+        Names in the model of the images without a mask.
+
+    Raises:
+        ImageError: a mask does not decode, or has another size than its image.
+        OSError: the disk refused.
+    """
+    _make_folders(folder, "masks", scales)
+    _each_camera_at_once(images, partial(_write_mask, masks, folder, scales))
+    return tuple(image.source.name for image, _ in images if find_mask(masks, image) is None)
+
+
+def encoded(suffix: str, pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> bytes:
+    """The content of an image file; in memory, because OpenCV does not tell when a disk is full."""
+    _, data = cv2.imencode(suffix, pixels, JPEG_PARAMS if suffix == ".jpg" else PNG_PARAMS)
+    return data.tobytes()
+
+
+def _make_folders(folder: Path, kind: str, scales: Sequence[int]) -> None:
+    for name in (kind, *(f"{kind}_{scale}" for scale in scales)):
+        (folder / name).mkdir()
+
+
+def _each_camera_at_once(
+    images: Sequence[tuple[TrainerImage, str]], write: Callable[[TrainerImage, str, _Lookup], None]
+) -> None:
+    """Call ``write`` on every image from several threads; images of one camera share its lookup."""
+    chunks = []
+    by_camera = sorted(images, key=lambda entry: id(entry[0].camera))
+    for _, group in groupby(by_camera, key=lambda entry: id(entry[0].camera)):
+        of_camera = list(group)
+        chunks += [of_camera[k : k + IMAGES_PER_LOOKUP] for k in range(0, len(of_camera), IMAGES_PER_LOOKUP)]
+
+    def work(chunk: list[tuple[TrainerImage, str]]) -> None:
+        camera = chunk[0][0].camera
+        lookup = None if camera.is_identity else camera.lookup()
+        for image, name in chunk:
+            write(image, name, lookup)
+
+    with ThreadPoolExecutor(min(usable_cores(), MAX_THREADS)) as pool:
+        for _ in pool.map(work, chunks):
+            pass
+
+
+def _write_image(folder: Path, scales: Sequence[int], image: TrainerImage, name: str, lookup: _Lookup) -> None:
+    if image.verbatim:
+        shutil.copyfile(image.source.path, folder / "images" / name)
+    if not image.verbatim or scales:
+        rgb = load_rgb(image.source)
+        bgr = np.ascontiguousarray((rgb if lookup is None else resampled(rgb, lookup))[:, :, ::-1])
+        if not image.verbatim:
+            (folder / "images" / name).write_bytes(encoded(image.suffix, bgr))
+        for scale in scales:
+            smaller = _smaller(bgr, scale, cv2.INTER_AREA)
+            (folder / f"images_{scale}" / name).write_bytes(encoded(image.suffix, smaller))
+
+
+def _write_mask(
+    masks: Path,
+    folder: Path,
+    scales: Sequence[int],
+    image: TrainerImage,
+    name: str,
+    lookup: _Lookup,
+) -> None:
+    mask = _load_mask(masks, image)
+    kept = mask if lookup is None else resampled(mask, lookup, nearest=True)
+    names = (PurePosixPath(name).with_suffix(".png").name, f"{name}.png")
+    for below, pixels in (
+        ("masks", kept),
+        *((f"masks_{scale}", _smaller(kept, scale, cv2.INTER_NEAREST)) for scale in scales),
+    ):
+        content = encoded(".png", pixels)
+        for mask_name in names:
+            (folder / below / mask_name).write_bytes(content)
+
+
+def _load_mask(masks: Path, image: TrainerImage) -> UInt8Array:
+    """(H, W) of the original image, 255 where it is kept."""
+    shape = (image.source.height, image.source.width)
+    path = find_mask(masks, image)
+    if path is None:
+        return np.full(shape, 255, np.uint8)
+    mask = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), cv2.IMREAD_GRAYSCALE)
+    if mask is None:
+        raise ImageError(f"{path}: no image that can be read; masks are PNG files, black where nothing is used")
+    if mask.shape != shape:
+        raise ImageError(
+            f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]} px and its image {shape[1]}x{shape[0]};"
+            " masks have the size of the original image"
+        )
+    return np.where(mask > 0, 255, 0).astype(np.uint8)
+
+
+def _smaller(pixels: UInt8Array, scale: int, how: int) -> UInt8Array:
+    height, width = pixels.shape[:2]
+    return np.asarray(cv2.resize(pixels, (width // scale, height // scale), interpolation=how), np.uint8)
+
+
+def check_scales(scales: Sequence[int], images: Sequence[TrainerImage]) -> None:
+    """Refuse scales that are no whole numbers from 2 on, repeat, or leave nothing of the smallest image.
+
+    Raises:
+        InputError: naming the scale.
+    """
+    shortest = min(min(image.camera.size) for image in images)
+    for scale in scales:
+        if scale < 2 or scale > shortest or scales.count(scale) > 1:
+            raise InputError(
+                f"trainer scale {scale}: needed are different whole numbers from 2 to {shortest}, such as 2, 4, 8"
+            )
