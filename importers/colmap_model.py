@@ -1,0 +1,218 @@
+"""A COLMAP model that another program wrote, made usable as a start: cameras, poses, surface points.
+
+Other people's exports are read for what they mean; what had to be set right is told in words and counts.
+Two mistakes cannot be seen in the numbers: camera centres where translations belong, and rotations from
+camera to world. Whoever refines such a model finds hardly a match that agrees with it.
+The next module to read is ``fitted_model``, which joins the model with the image files.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from smust3r_colmap.errors import InputError
+from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.importers.colmap_records import CameraRecord, ImageRecord, PointRecords, Repairs, read_records
+from smust3r_colmap.products import EMPTY_CLOUD, PointCloud, RejectedImage
+
+logger = logging.getLogger(__name__)
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+MIN_IMAGES = 2
+ROUNDED_QUATERNION = 1e-4
+"""How far the length of a quaternion may be from 1 without a word: text with five digits."""
+USABLE_QUATERNION = 0.1
+"""Beyond that it is no rotation written carelessly, but another number: a shifted column, an unscaled axis."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SurfacePoints:
+    """Points of the surface, and where it is known which images see them.
+
+    Args:
+        cloud: in the world of the model; may be empty.
+        point_of_observation: (M,) row of the cloud. image_of_observation: (M,) number of the image. Only points
+            that two images or more see have observations, and each image is named once.
+    """
+
+    cloud: PointCloud
+    point_of_observation: IntArray
+    image_of_observation: IntArray
+
+    def __post_init__(self) -> None:
+        if self.point_of_observation.shape != self.image_of_observation.shape:
+            raise ValueError("SurfacePoints: the arrays of observations differ in length")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ForeignModel:
+    """A model from anybody, checked and repaired.
+
+    Args:
+        folder: where its files lie.
+        names: of the images that have a pose, as the model spells them, without repeats.
+        camera_ids: of each image, keys of ``cameras``.
+        cameras: intrinsics, at whatever image size the model says.
+        cam_from_world: (N, 3, 4) rigid.
+        surface: its points; images are positions in ``names``.
+        unposed: images that are in the files but have no usable pose.
+        repairs: what was set right, one sentence each, with counts.
+    """
+
+    folder: Path
+    names: tuple[str, ...]
+    camera_ids: tuple[int, ...]
+    cameras: Mapping[int, Intrinsics]
+    cam_from_world: FloatArray
+    surface: SurfacePoints
+    unposed: tuple[RejectedImage, ...]
+    repairs: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        if len(set(self.names)) != n or len(self.camera_ids) != n or self.cam_from_world.shape != (n, 3, 4):
+            raise ValueError(f"ForeignModel: {n} names, {len(self.camera_ids)} cameras, {self.cam_from_world.shape}")
+        if missing := set(self.camera_ids) - set(self.cameras):
+            raise ValueError(f"ForeignModel: no intrinsics for cameras {sorted(missing)}")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def read_colmap_model(folder: Path) -> ForeignModel:
+    """Read the model in ``folder``, binary or text; see ``colmap_records`` for where it is looked for.
+
+    Points may be missing altogether. Tracks are kept where two images or more of the model stand in them;
+    elements that name other images, such as the ``0 0`` that fill the lines of some exporters, are dropped.
+
+    Raises:
+        InputError: no model, a broken file, a duplicate image id or name, an unknown camera, a rotation that is
+            none, or fewer than two images with a pose; names file, line and number.
+    """
+    repairs = Repairs()
+    records = read_records(folder, repairs)
+    posed = [record for record in records.images if np.isfinite(record.numbers).all()]
+    if len(posed) < MIN_IMAGES:
+        raise InputError(
+            f"{records.folder}: {len(posed)} of {len(records.images)} images have a pose, needed are {MIN_IMAGES}"
+        )
+    _refuse_twins([(record.camera_id, record.place) for record in records.cameras], "camera id")
+    _refuse_twins([(record.image_id, record.place) for record in records.images], "image id")
+    names = [_tidy_name(record, repairs) for record in posed]
+    _refuse_twins([(name, record.place) for name, record in zip(names, posed, strict=True)], "image name")
+    cameras = {record.camera_id: record for record in records.cameras}
+    first_image_of = {record.camera_id: record for record in reversed(posed)}
+    model = ForeignModel(
+        folder=records.folder,
+        names=tuple(names),
+        camera_ids=tuple(record.camera_id for record in posed),
+        cameras={camera_id: _intrinsics(cameras, image) for camera_id, image in sorted(first_image_of.items())},
+        cam_from_world=np.stack([_cam_from_world(record, repairs) for record in posed]),
+        surface=_surface(records.points, [record.image_id for record in posed], records.folder, repairs),
+        unposed=tuple(
+            RejectedImage(name=record.name, reason=f"its pose in the model is not finite ({record.place})")
+            for record in records.images
+            if record not in posed
+        ),
+        repairs=repairs.texts(),
+    )
+    logger.info("%s: %d images, %d points", model.folder, len(model), len(model.surface.cloud))
+    return model
+
+
+def _refuse_twins(keys: Sequence[tuple[Hashable, str]], what: str) -> None:
+    place_of: dict[Hashable, str] = {}
+    for key, place in keys:
+        if key in place_of:
+            raise InputError(f"{place}: {what} {key!r} was there before ({place_of[key]}); every {what} may stand once")
+        place_of[key] = place
+
+
+def _tidy_name(record: ImageRecord, repairs: Repairs) -> str:
+    """With forward slashes, as names are in COLMAP."""
+    repairs.note("image names with backslashes", record.place, count="\\" in record.name)
+    name = record.name.replace("\\", "/")
+    if not name:
+        raise InputError(f"{record.place}: image {record.image_id} has no name; write the name of its file")
+    return name
+
+
+def _intrinsics(cameras: Mapping[int, CameraRecord], image: ImageRecord) -> Intrinsics:
+    """The camera of an image, as numbers that COLMAP can use."""
+    record = cameras.get(image.camera_id)
+    if record is None:
+        known = ", ".join(map(str, sorted(cameras)[:5])) or "none"
+        raise InputError(
+            f"{image.place}: {image.name} has camera {image.camera_id}, which is not there; known: {known}"
+        )
+    try:
+        intrinsics = Intrinsics(
+            model=record.model, width=record.width, height=record.height, params=record.params, has_prior_focal=True
+        )
+    except ValueError as error:
+        raise InputError(f"{record.place}: camera {record.camera_id} cannot be used: {error}") from error
+    focal = [record.params[k] for k in intrinsics.colmap_camera().focal_length_idxs()]
+    if any(value <= 0 for value in focal):
+        raise InputError(
+            f"{record.place}: camera {record.camera_id} has focal length {min(focal):g}; it must be positive"
+        )
+    return intrinsics
+
+
+def _cam_from_world(record: ImageRecord, repairs: Repairs) -> FloatArray:
+    """(3, 4), the rotation being that of the nearest unit quaternion."""
+    quat_wxyz, translation = np.asarray(record.numbers[:4]), np.asarray(record.numbers[4:])
+    length = float(np.linalg.norm(quat_wxyz))
+    if abs(length - 1) > USABLE_QUATERNION:
+        raise InputError(
+            f"{record.place}: the quaternion of {record.name} has length {length:.4g}, needed is 1; are the columns "
+            "QW QX QY QZ TX TY TZ?"
+        )
+    repairs.note("quaternions were brought to length 1", record.place, count=abs(length - 1) > ROUNDED_QUATERNION)
+    rotation = Rotation.from_quat(quat_wxyz[[1, 2, 3, 0]]).as_matrix()
+    return np.column_stack([rotation, translation])
+
+
+def _surface(points: PointRecords | None, image_ids: Sequence[int], folder: Path, repairs: Repairs) -> SurfacePoints:
+    """The finite points, and of their tracks what is evidence; images by their position in ``image_ids``."""
+    if points is None:
+        repairs.note("files of points are missing", str(folder))
+        nothing = np.empty(0, np.int64)
+        return SurfacePoints(cloud=EMPTY_CLOUD, point_of_observation=nothing, image_of_observation=nothing)
+    finite: npt.NDArray[np.bool_] = np.asarray(np.isfinite(points.xyz).all(axis=1))
+    colours = np.nan_to_num(points.rgb[finite]).clip(0, 255).astype(np.uint8)
+    repairs.note("points with a coordinate that is not finite were left out", str(folder), int((~finite).sum()))
+    point, image = _evidence(points, np.asarray(image_ids), finite, folder, repairs)
+    return SurfacePoints(
+        cloud=PointCloud(xyz=points.xyz[finite], rgb=colours),
+        point_of_observation=(np.cumsum(finite) - 1)[point],
+        image_of_observation=image,
+    )
+
+
+def _evidence(
+    points: PointRecords, image_ids: IntArray, usable: npt.NDArray[np.bool_], folder: Path, repairs: Repairs
+) -> tuple[IntArray, IntArray]:
+    """Row of the point and position of the image, (M,) each, each pair once, of points in two images or more."""
+    order = np.argsort(image_ids)
+    place = np.minimum(np.searchsorted(image_ids, points.image_id_of_element, sorter=order), len(image_ids) - 1)
+    image = order[place]
+    known = image_ids[image] == points.image_id_of_element
+    repairs.note("track elements name an image that has no pose here", str(folder), int((~known).sum()))
+    known &= usable[points.point_of_element]
+    each_once = np.unique(points.point_of_element[known] * len(image_ids) + image[known])
+    point, image = np.divmod(each_once, len(image_ids))
+    num_views = np.bincount(point, minlength=len(points.xyz))
+    alone = np.bincount(points.point_of_element, minlength=len(points.xyz)).astype(bool) & usable & (num_views < 2)
+    repairs.note("points have a track that is none (fewer than two images) and lost it", str(folder), int(alone.sum()))
+    seen_by_two = num_views[point] >= 2
+    return point[seen_by_two], image[seen_by_two]

@@ -1,0 +1,396 @@
+"""A model from anybody, joined with the image files it was made of.
+
+Files are found by name, as far as that is beyond doubt. Cameras are brought to the size of the files, because
+many programs write them at the size of their network, and cameras that are the same within the scatter of a
+network become one. The next module to read is ``refine_command``.
+"""
+
+from __future__ import annotations
+
+import unicodedata
+from collections import Counter, defaultdict
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+from statistics import median
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from smust3r_colmap.errors import ConfigError, InputError
+from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.importers.colmap_model import MIN_IMAGES, ForeignModel, SurfacePoints
+from smust3r_colmap.importers.image_folder import FolderScan, natural_key
+from smust3r_colmap.importers.images import Photo
+from smust3r_colmap.products import ImageCollection, RejectedImage, Scene, SourceImage
+
+ASPECT_TOLERANCE = 0.05
+"""Relative difference of width / height up to which a camera is that of the image, resized. Networks round sides to
+multiples of 14 or 16 px: at most 7 px of a side of 147 px, where 518 px are the longer one. 4:3 and 3:2 differ by
+an eighth."""
+
+SAME_FOCAL = 0.1
+"""Relative distance from the median focal length within which cameras are one: a network's guesses for one lens
+scatter by a few percent, a zoom that was touched changes it by more."""
+
+ENOUGH_SEEN = 50
+"""Points that say which surface an image sees; with fewer the whole cloud says it better."""
+
+_NAMES_SHOWN = 5
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FittedModel:
+    """A foreign model whose images are files that can be read.
+
+    Args:
+        collection: the images of the model, in natural order of their names; ``rejected`` are those without
+            pose or file. Cameras are start values at the size of the files.
+        cam_from_world: (N, 3, 4) rigid, one per image of the collection.
+        surface: the model's points; images by their index in the collection.
+        remarks: what was assumed or changed, one sentence each, with numbers.
+    """
+
+    collection: ImageCollection
+    cam_from_world: npt.NDArray[np.float64]
+    surface: SurfacePoints
+    remarks: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if self.cam_from_world.shape != (len(self.collection), 3, 4):
+            raise ValueError(f"FittedModel: {len(self.collection)} images, poses {self.cam_from_world.shape}")
+
+    def seen_by_tracks(self) -> dict[int, npt.NDArray[np.float64]]:
+        """(S, 3) world points by image index, of the images in whose tracks ``ENOUGH_SEEN`` points stand."""
+        rows_of: dict[int, list[int]] = defaultdict(list)
+        for image, row in zip(
+            self.surface.image_of_observation.tolist(), self.surface.point_of_observation.tolist(), strict=True
+        ):
+            rows_of[image].append(row)
+        return {image: self.surface.cloud.xyz[rows] for image, rows in rows_of.items() if len(rows) >= ENOUGH_SEEN}
+
+    def scene(self, origin: str) -> Scene:
+        """As what a stitched run has before its refinement; ``origin`` says where it comes from.
+
+        A foreign model never says what its unit is, so the scene is not metric.
+        """
+        images = self.collection.images
+        return Scene(
+            image_indices=tuple(range(len(images))),
+            image_names=tuple(image.name for image in images),
+            camera_indices=tuple(image.camera for image in images),
+            cameras=dict(enumerate(self.collection.cameras)),
+            cam_from_world=self.cam_from_world,
+            points=self.surface.cloud,
+            metric=False,
+            segments=(origin,),
+        )
+
+
+def fit_to_images(
+    model: ForeignModel,
+    scan: FolderScan,
+    *,
+    share_cameras: bool = True,
+    camera_model: str = "",
+    calibrated: bool = False,
+) -> FittedModel:
+    """Find the file of every image, and the camera of every file.
+
+    Args:
+        model: as ``read_colmap_model`` gives it.
+        scan: the image folder.
+        share_cameras: cameras that have one image each become one, where the images lie in one folder, have one
+            size and one EXIF camera, and the focal lengths agree within ``SAME_FOCAL``.
+        camera_model: COLMAP's name of the model that all cameras shall have; empty keeps what each has, but turns
+            pinholes into SIMPLE_RADIAL, since most of them are guesses and photographs are distorted.
+        calibrated: the cameras are known; they are brought to the size of the files and otherwise stay.
+
+    Raises:
+        InputError: a name fits several files, two images fit one file, fewer than two images have a file, or the
+            image of a camera has another shape than its file.
+        ConfigError: a camera cannot be written in ``camera_model``, or ``calibrated`` contradicts it.
+    """
+    if calibrated and camera_model:
+        raise ConfigError(
+            f"--camera-model {camera_model}: with --calibrated the cameras stay as they are; leave one out"
+        )
+    remarks = list(model.repairs)
+    matched, rejected = _match_files(model, scan, remarks)
+    order = sorted(matched, key=lambda position: natural_key(matched[position].name))
+    files = [matched[position] for position in order]
+    owners = [model.camera_ids[position] for position in order]
+    resized = [
+        _resized_to_file(model.cameras[owner], file, f"{owner} of {model.folder}")
+        for owner, file in zip(owners, files, strict=True)
+    ]
+    _remark_on_sizes([model.cameras[owner] for owner in owners], resized, remarks)
+    keys: list[Hashable] = [(owner, file.size) for owner, file in zip(owners, files, strict=True)]
+    if share_cameras and not calibrated:
+        keys = _shared_keys(keys, resized, files, remarks)
+    cameras, camera_of = _one_per_key(keys, resized)
+    images = tuple(
+        SourceImage(
+            name=file.name,
+            path=scan.folder / file.name,
+            width=file.photo.width,
+            height=file.photo.height,
+            camera=camera,
+            digest=file.digest,
+        )
+        for file, camera in zip(files, camera_of, strict=True)
+    )
+    return FittedModel(
+        collection=ImageCollection(
+            images=images,
+            cameras=cameras if calibrated else _remodelled(cameras, camera_model, remarks),
+            rejected=(*model.unposed, *rejected),
+            calibrated=calibrated,
+        ),
+        cam_from_world=model.cam_from_world[order],
+        surface=_renumbered(model.surface, order, len(model)),
+        remarks=tuple(remarks),
+    )
+
+
+def _renumbered(surface: SurfacePoints, order: Sequence[int], num_before: int) -> SurfacePoints:
+    """Images by their index in the collection; what only images without a file had seen is seen by nobody."""
+    index_of = np.full(num_before, -1)
+    index_of[list(order)] = np.arange(len(order))
+    image = index_of[surface.image_of_observation]
+    num_views = np.bincount(surface.point_of_observation[image >= 0], minlength=len(surface.cloud))
+    kept = (image >= 0) & (num_views[surface.point_of_observation] >= 2)
+    return SurfacePoints(
+        cloud=surface.cloud,
+        point_of_observation=surface.point_of_observation[kept],
+        image_of_observation=image[kept],
+    )
+
+
+# ----------------------------------------------------------------------------- names
+@dataclass(frozen=True, kw_only=True)
+class _File:
+    """A file that decodes."""
+
+    name: str
+    digest: str
+    photo: Photo
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.photo.width, self.photo.height
+
+    @property
+    def source(self) -> tuple[Hashable, ...]:
+        """Equal for files that may come from one camera: folder, size and what EXIF says of the lens."""
+        tags = self.photo.tags
+        folder = PurePosixPath(self.name).parent
+        return str(folder), self.size, tags.make, tags.model, tags.focal_mm, tags.focal_35mm
+
+
+_SPELLINGS: Mapping[str, Callable[[str], str]] = {
+    "name": lambda name: unicodedata.normalize("NFC", name),
+    "base name": lambda name: unicodedata.normalize("NFC", PurePosixPath(name).name),
+    "name without suffix": lambda name: unicodedata.normalize("NFC", PurePosixPath(name).stem),
+}
+"""How a name may be taken, the strictest first."""
+
+
+def _match_files(
+    model: ForeignModel, scan: FolderScan, remarks: list[str]
+) -> tuple[dict[int, _File], list[RejectedImage]]:
+    """The file of each image by its position in the model, and the images that have none that can be read."""
+    reasons = {one.name: one.reason for one in scan.unreadable}
+    reasons |= {record.name: record.reason for record in scan.records if record.photo is None}
+    usable = {
+        record.name: _File(name=record.name, digest=record.digest, photo=record.photo)
+        for record in scan.records
+        if record.photo is not None
+    }
+    found = _found_names(model, [*usable, *reasons], scan, remarks)
+    matched = {position: usable[name] for position, name in found.items() if name in usable}
+    rejected = [
+        RejectedImage(name=model.names[p], reason=reasons[name]) for p, name in found.items() if name in reasons
+    ]
+    rejected += [
+        RejectedImage(name=name, reason=f"has a pose, but no file of that name is in {scan.folder}")
+        for position, name in enumerate(model.names)
+        if position not in found
+    ]
+    if len(matched) < MIN_IMAGES:
+        raise InputError(
+            f"{scan.folder}: has usable files for {len(matched)} of {len(model)} images of {model.folder}, needed are "
+            f"{MIN_IMAGES}; the model names {_few(model.names)}, the folder has {_few([*usable, *reasons])}"
+        )
+    unused = sorted(usable.keys() - found.values(), key=natural_key)
+    if unused:
+        remarks.append(f"{len(unused)} files of the folder are not in the model and stay out: {_few(unused)}")
+    return matched, rejected
+
+
+def _found_names(
+    model: ForeignModel, file_names: Sequence[str], scan: FolderScan, remarks: list[str]
+) -> dict[int, str]:
+    """File names by the position of their image; an image that no spelling finds is left out."""
+    found: dict[int, str] = {}
+    for how, spelling in _SPELLINGS.items():
+        candidates: dict[str, list[str]] = defaultdict(list)
+        for name in file_names:
+            candidates[spelling(name)].append(name)
+        newly = {}
+        for position, name in enumerate(model.names):
+            if position in found or not (fitting := candidates.get(spelling(name), [])):
+                continue
+            if len(fitting) > 1:
+                raise InputError(
+                    f"{model.folder}: image {name!r} could be {_few(fitting)} of {scan.folder}, which share its {how}; "
+                    "give the image the path of its file below that folder"
+                )
+            newly[position] = fitting[0]
+        found |= newly
+        if newly and how != "name":
+            position, name = next(iter(newly.items()))
+            remarks.append(f"{len(newly)} images found by their {how}, such as {model.names[position]!r} as {name!r}")
+    image_of: dict[str, str] = {}
+    for position, name in found.items():
+        if name in image_of:
+            raise InputError(
+                f"{model.folder}: images {image_of[name]!r} and {model.names[position]!r} both fit the file {name!r}; "
+                f"leave one out, or give both the paths of their files below {scan.folder}"
+            )
+        image_of[name] = model.names[position]
+    return found
+
+
+def _few(names: Iterable[str]) -> str:
+    shown = [repr(name) for name in names]
+    more = len(shown) - _NAMES_SHOWN
+    return ", ".join(shown[:_NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "") or "nothing"
+
+
+# --------------------------------------------------------------------------- cameras
+def _resized_to_file(camera: Intrinsics, file: _File, owner: str) -> Intrinsics:
+    """The camera at the size of the file; each axis is scaled by itself, as the network's input was.
+
+    Raises:
+        InputError: the shapes differ by more than ``ASPECT_TOLERANCE``: the image was cropped, padded or turned.
+    """
+    width, height = file.size
+    if _relative_difference(camera.width / camera.height, width / height) <= ASPECT_TOLERANCE:
+        return camera.resized(width, height)
+    if _relative_difference(camera.width / camera.height, height / width) <= ASPECT_TOLERANCE:
+        way_out = "the model is of the image lying on its side, as it is without its EXIF orientation; turn the file"
+    else:
+        way_out = "it was cropped or padded; give the images that the model was made of, or cameras for these"
+    raise InputError(
+        f"{file.name}: is {width}x{height} px, its camera {owner} is for {camera.width}x{camera.height} px; "
+        f"shapes that differ by more than {ASPECT_TOLERANCE:.0%} were not only resized: {way_out}"
+    )
+
+
+def _relative_difference(value: float, reference: float) -> float:
+    return abs(value / reference - 1)
+
+
+def _remark_on_sizes(before: Sequence[Intrinsics], after: Sequence[Intrinsics], remarks: list[str]) -> None:
+    changes = Counter(
+        f"{old.width}x{old.height} to {new.width}x{new.height}"
+        for old, new in zip(before, after, strict=True)
+        if (old.width, old.height) != (new.width, new.height)
+    )
+    for change, count in changes.items():
+        remarks.append(f"{count} images had intrinsics at another size than their files: rescaled from {change} px")
+
+
+def _shared_keys(
+    keys: Sequence[Hashable], cameras: Sequence[Intrinsics], files: Sequence[_File], remarks: list[str]
+) -> list[Hashable]:
+    """One key for cameras that are the same but for scatter; a camera that had several images keeps its own."""
+    num_images = Counter(keys)
+    groups: dict[Hashable, list[int]] = defaultdict(list)
+    for k, (key, camera, file) in enumerate(zip(keys, cameras, files, strict=True)):
+        if num_images[key] == 1:
+            groups[file.source, camera.model].append(k)
+    shared = list(keys)
+    for source, members in groups.items():
+        middle = median(cameras[k].focal_px for k in members)
+        alike = [k for k in members if _relative_difference(cameras[k].focal_px, middle) <= SAME_FOCAL]
+        if len(alike) < 2:
+            continue
+        for k in alike:
+            shared[k] = source
+        focals = sorted(cameras[k].focal_px for k in alike)
+        remarks.append(
+            f"{len(alike)} cameras with one image each became one; their focal lengths were {focals[0]:.0f} to "
+            f"{focals[-1]:.0f} px"
+        )
+    return shared
+
+
+def _one_per_key(
+    keys: Sequence[Hashable], cameras: Sequence[Intrinsics]
+) -> tuple[tuple[Intrinsics, ...], tuple[int, ...]]:
+    """The camera of each key, with the median of each parameter, in order of first appearance; its number by image."""
+    members: dict[Hashable, list[Intrinsics]] = defaultdict(list)
+    for key, camera in zip(keys, cameras, strict=True):
+        members[key].append(camera)
+    numbers = {key: number for number, key in enumerate(members)}
+    typical = (
+        replace(alike[0], params=tuple(np.median([camera.params for camera in alike], axis=0)))
+        for alike in members.values()
+    )
+    return tuple(typical), tuple(numbers[key] for key in keys)
+
+
+_PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""Models that mean the same by a parameter of the same name."""
+
+
+def _remodelled(cameras: Sequence[Intrinsics], wanted: str, remarks: list[str]) -> tuple[Intrinsics, ...]:
+    """All cameras in the model ``wanted``, or, where it is empty, pinholes of square pixels as SIMPLE_RADIAL."""
+    if wanted:
+        return tuple(_converted(camera, wanted) for camera in cameras)
+    changed = tuple(_converted(camera, "SIMPLE_RADIAL") if _may_be_radial(camera) else camera for camera in cameras)
+    count = sum(new != old for new, old in zip(changed, cameras, strict=True))
+    if count:
+        remarks.append(
+            f"pinhole cameras became SIMPLE_RADIAL ({count} of {len(cameras)}), for photographs are distorted; "
+            "--camera-model PINHOLE keeps them, for undistorted images"
+        )
+    return changed
+
+
+def _may_be_radial(camera: Intrinsics) -> bool:
+    if camera.model == "PINHOLE":
+        return _relative_difference(camera.params[0], camera.params[1]) <= ASPECT_TOLERANCE
+    return camera.model == "SIMPLE_PINHOLE"
+
+
+def _converted(camera: Intrinsics, model: str) -> Intrinsics:
+    """The same camera in another perspective model: parameters by name, the others zero.
+
+    Raises:
+        ConfigError: one of the two is not perspective.
+    """
+    if camera.model == model:
+        return camera
+    if camera.model not in _PERSPECTIVE or model not in _PERSPECTIVE:
+        raise ConfigError(
+            f"--camera-model {model}: a camera of the model is {camera.model}; one can become another only among "
+            f"{', '.join(_PERSPECTIVE)}"
+        )
+    old = camera.colmap_camera()
+    new = pycolmap.Camera.create_from_model_name(1, model, camera.focal_px, camera.width, camera.height)
+    value_of = dict(zip(_parameter_names(old), camera.params, strict=True))
+    if "f" in value_of:
+        value_of["fx"] = value_of["fy"] = value_of["f"]
+    value_of["f"] = camera.focal_px
+    params = tuple(value_of.get(name, 0.0) for name in _parameter_names(new))
+    return replace(camera, model=model, params=params)
+
+
+def _parameter_names(camera: pycolmap.Camera) -> list[str]:
+    """As COLMAP lists them, the only radial term of a model being the first one of others."""
+    names = [name.strip() for name in camera.params_info.split(",")]
+    return ["k1" if name == "k" else name for name in names]

@@ -1,0 +1,312 @@
+"""Real tracks and bundle adjustment for a model that another program made, start to end.
+
+    read      anybody's files, repaired                     importers.colmap_model
+    fit       to the image files, at their size             importers.fitted_model
+    match     neighbours, where no points say who sees what
+    refine    as in a run of ours                           refinement.refine
+    export    as in a run of ours                           exports
+
+Exports of feed-forward networks have poses that are nearly right, cameras at the size of the network and no
+tracks; here such a model takes the place of the stitched one. The next module to read is ``refine_command``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from smust3r_colmap.backbones.classical.features import match_pairs
+from smust3r_colmap.backbones.classical.run_features import features_of_run
+from smust3r_colmap.config import RunConfig
+from smust3r_colmap.config_file import config_to_toml
+from smust3r_colmap.errors import ConfigError
+from smust3r_colmap.execution import usable_cores
+from smust3r_colmap.exporters.aside import replace_file
+from smust3r_colmap.exporters.colmap_sparse import MODEL_FILES, refuse_names_text_cannot_hold
+from smust3r_colmap.exporters.tum_trajectory import write_tum
+from smust3r_colmap.exports import FORMATS, FormatSettings, Outputs, write_where_possible
+from smust3r_colmap.finished_run import FinishedRun, forget_finished, write_finished
+from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.importers.colmap_model import ForeignModel, read_colmap_model
+from smust3r_colmap.importers.fitted_model import FittedModel, fit_to_images
+from smust3r_colmap.importers.image_folder import ImportRecord, check_output_not_inside, scan_image_folder
+from smust3r_colmap.pipeline import refinement_summaries
+from smust3r_colmap.products import FloatArray, PointCloud, RunFeatures, Scene
+from smust3r_colmap.progress import Reporter
+from smust3r_colmap.refinement.correspondences import Pair
+from smust3r_colmap.refinement.refine import Refinement, refine, surfaces_of_clouds
+from smust3r_colmap.run_directory import RunDirectory, key_of, read_json, write_json
+from smust3r_colmap.segmentation.windows import plan_windows
+from smust3r_colmap.stage_clock import StageClock, peak_memory_bytes
+from smust3r_colmap.stored_scene import write_scenes
+from smust3r_colmap.summary import GraphSummary, ImageRemark, ModelSummary, RunSummary
+
+MAX_TURN_DEG = 60.0
+"""Of two cameras without points between them: what one sees straight ahead is beyond the edge of the other."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraChoice:
+    """What is to become of the model's cameras; see ``fit_to_images``."""
+
+    share: bool = True
+    model: str = ""
+    calibrated: bool = False
+
+
+def refine_model(
+    model: Path,
+    images: Path,
+    output: Path,
+    config: RunConfig,
+    *,
+    cameras: CameraChoice,
+    pose_tolerance: float,
+    fresh: bool = False,
+    reporter: Reporter,
+) -> RunSummary:
+    """From a COLMAP model of poor poses to one with tracks in ``output/sparse/0``, and a database that goes with it.
+
+    Args:
+        model: folder of the model; it is only read.
+        images: folder of its images.
+        output: made when missing; what an earlier start finished there is used.
+        config: ``classical`` (features), ``refinement``, ``output``, ``segmentation`` (parts of large models),
+            ``workers`` and ``seed`` are used.
+        cameras: what is to become of the cameras.
+        pose_tolerance: how far from its epipolar line a match may lie at first, as a part of the longer image side.
+        fresh: start over.
+        reporter: told about every stage.
+
+    Raises:
+        InputError: the model, the images or the settings cannot be used.
+        RunDirectoryError: the output folder cannot be used, is held by another run, or the disk refused.
+    """
+    check_output_not_inside(images, output)
+    foreign = read_colmap_model(model)
+    _refuse_to_overwrite(foreign.folder, output)
+    with RunDirectory(output, fresh=fresh) as run:
+        forget_finished(run)
+        clock = StageClock(reporter)
+        fitted = _fit(foreign, images, config, cameras, run, clock)
+        start = fitted.scene(origin=foreign.folder.name)
+        features = _features(fitted, start, config, run, clock)
+        refinement = _refine(fitted, start, features, config, run, clock, tolerance=pose_tolerance)
+        _doubt_the_poses(refinement, clock)
+        result = _with_points(start, refinement)
+        outputs = _export(result, start, refinement, images, config, run, clock)
+        summary = _summarise(fitted, result, refinement, outputs, run, clock)
+        write_json(run.root / "summary.json", {**summary.to_json_dict(), "model_remarks": fitted.remarks})
+    return summary
+
+
+def _refuse_to_overwrite(model: Path, output: Path) -> None:
+    """The results would take the place of what they are made of."""
+    if output.resolve() in (model.resolve(), *model.resolve().parents):
+        raise ConfigError(f"--output {output}: the model {model} lies there and would be lost; name another folder")
+
+
+def _fit(
+    foreign: ForeignModel, images: Path, config: RunConfig, cameras: CameraChoice, run: RunDirectory, clock: StageClock
+) -> FittedModel:
+    """Files that did not change since an earlier start are not decoded again."""
+    stored = run.stage("import", key=key_of("import"))
+    with clock.stage("import", total=1) as stage:
+        known = {}
+        if stored.is_done:
+            records = (ImportRecord.from_json(facts) for facts in read_json(stored.path / "records.json"))
+            known = {record.name: record for record in records}
+        scan = scan_image_folder(images, known=known, workers=config.workers)
+        with stored.write() as folder:
+            write_json(folder / "records.json", [record.to_json() for record in scan.records])
+        fitted = fit_to_images(
+            foreign, scan, share_cameras=cameras.share, camera_model=cameras.model, calibrated=cameras.calibrated
+        )
+        if config.output.text:
+            refuse_names_text_cannot_hold(image.name for image in fitted.collection.images)
+        stage.advance()
+    for remark in fitted.remarks:
+        clock.note(remark)
+    for rejected in fitted.collection.rejected:
+        clock.warn(f"left out: {rejected.name} ({rejected.reason})")
+    return fitted
+
+
+# --------------------------------------------------------------------------- matching
+def _features(
+    fitted: FittedModel, start: Scene, config: RunConfig, run: RunDirectory, clock: StageClock
+) -> RunFeatures:
+    """SIFT of all images; without points also the matches of neighbours, for there is no surface to choose pairs by."""
+    workers = config.workers or usable_cores()
+    features = features_of_run(fitted.collection, config.classical, run, clock, workers=workers, seed=config.seed)
+    if len(start.points):
+        return features
+    pairs = neighbouring_pairs(
+        start.cam_from_world,
+        per_image=config.refinement.track_neighbours,
+        exhaustive_below=config.classical.exhaustive_below,
+    )
+    usable = [pair for pair in pairs if features.usable[pair[0]] and features.usable[pair[1]]]
+    with clock.stage("matching", total=len(usable)) as stage:
+        match_pairs(features.database, usable, workers=workers, seed=config.seed, log_file=run.native_log, stage=stage)
+    return features
+
+
+def neighbouring_pairs(cam_from_world: FloatArray, *, per_image: int, exhaustive_below: int) -> tuple[Pair, ...]:
+    """Pairs (i < j) of cameras that stand near each other and look the same way; of few images, all.
+
+    Args:
+        cam_from_world: (N, 3, 4).
+        per_image: nearest others of each that differ by less than ``MAX_TURN_DEG``.
+        exhaustive_below: up to so many images every pair is taken.
+    """
+    n = len(cam_from_world)
+    if n <= exhaustive_below:
+        return tuple((i, j) for i in range(n) for j in range(i + 1, n))
+    centres, forward = invert_rigid(cam_from_world)[:, :, 3], cam_from_world[:, 2, :3]
+    pairs: set[Pair] = set()
+    for i in range(n):
+        distance = np.linalg.norm(centres - centres[i], axis=1)
+        distance[forward @ forward[i] < np.cos(np.deg2rad(MAX_TURN_DEG))] = np.inf
+        distance[i] = np.inf
+        nearest = np.argsort(distance, kind="stable")[:per_image]
+        pairs |= {(min(i, j), max(i, j)) for j in nearest[np.isfinite(distance[nearest])].tolist()}
+    return tuple(sorted(pairs))
+
+
+def _refine(
+    fitted: FittedModel,
+    start: Scene,
+    features: RunFeatures,
+    config: RunConfig,
+    run: RunDirectory,
+    clock: StageClock,
+    *,
+    tolerance: float,
+) -> Refinement:
+    """Which surface an image sees is known from its tracks, else from the points that fall into it."""
+    windows = plan_windows(
+        len(start), segment_length=config.segmentation.segment_length, overlap=config.segmentation.overlap
+    )
+    return refine(
+        (start,),
+        fitted.collection,
+        None,
+        features,
+        config,
+        run,
+        clock,
+        parts=[window.images for window in windows],
+        surfaces=surfaces_of_clouds((start,)) | fitted.seen_by_tracks(),
+        tolerance=tolerance,
+    )
+
+
+def _doubt_the_poses(refinement: Refinement, clock: StageClock) -> None:
+    """Poses of another meaning look like any others, but hardly a match agrees with them."""
+    (figures,) = refinement.figures
+    if figures.kept and figures.num_refused_pairs <= figures.num_pairs:
+        return
+    clock.warn(
+        f"the matches of {figures.num_pairs} image pairs agree with the poses, those of {figures.num_refused_pairs} do "
+        "not; has the model camera centres in place of translations, or poses from camera to world? COLMAP's are "
+        "from world to camera"
+    )
+
+
+# ---------------------------------------------------------------------------- results
+def _with_points(start: Scene, refinement: Refinement) -> Scene:
+    """The refined scene with its tracked points; the given cloud hangs on cameras that have moved since."""
+    (folder,) = refinement.models
+    if folder is None:
+        return start
+    points = pycolmap.Reconstruction(folder).points3D.values()
+    cloud = PointCloud(
+        xyz=np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
+        rgb=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+    )
+    return replace(refinement.scenes[0], points=cloud)
+
+
+def _export(
+    result: Scene,
+    start: Scene,
+    refinement: Refinement,
+    images: Path,
+    config: RunConfig,
+    run: RunDirectory,
+    clock: StageClock,
+) -> Outputs:
+    """The model, and where it has tracks its database; cloud, trajectory, and the one it began with; what failed."""
+    run.clear_results(MODEL_FILES)
+    has_tracks = any(refinement.models)
+    with run.stage("scene", key=key_of("scene", result)).write() as folder:
+        write_scenes(folder, (result,))
+    finished = FinishedRun(
+        output=run.root,
+        native_log=run.native_log,
+        images=images,
+        scenes=(result,),
+        models=refinement.models,
+        database=refinement.database if has_tracks else None,
+        maps=None,
+    )
+    settings = FormatSettings.of(config.output)
+    with clock.stage("export", total=1) as stage:
+        for name in ("sparse", "ply", "glb", "tum", *(("database",) if has_tracks else ())):
+            FORMATS[name].write(finished, settings)
+        write_tum(start, run.root / "trajectory_stitched_tum.txt", None)
+        replace_file(run.root / "config.toml", config_to_toml(config).encode())
+        write_finished(run, finished)
+        stage.advance()
+    large = config.output.large_formats if has_tracks else ()
+    return write_where_possible(finished, large, settings, clock)
+
+
+def _summarise(
+    fitted: FittedModel,
+    result: Scene,
+    refinement: Refinement,
+    outputs: Outputs,
+    run: RunDirectory,
+    clock: StageClock,
+) -> RunSummary:
+    """In the form of a reconstruction, so that programs need to know one; nothing was segmented or stitched here."""
+    return RunSummary(
+        output=run.root,
+        num_images=len(fitted.collection),
+        num_registered=len(result),
+        models=(
+            ModelSummary(
+                folder=run.sparse_model(0).relative_to(run.root).as_posix(),
+                num_images=len(result),
+                num_points=len(result.points),
+                metric=result.metric,
+                segments=result.segments,
+            ),
+        ),
+        rejected=tuple(ImageRemark(name=one.name, reason=one.reason) for one in fitted.collection.rejected),
+        unregistered=(),
+        stages=tuple(clock.stages),
+        segments=(),
+        edges=(),
+        loops=(),
+        loops_note="",
+        graph=GraphSummary(
+            num_nodes=1,
+            num_edges=0,
+            num_loops=0,
+            cost_before=0.0,
+            cost_after=0.0,
+            iterations=0,
+            stop_reason="a given model",
+            improved=False,
+        ),
+        peak_memory_bytes=peak_memory_bytes(),
+        refinements=refinement_summaries(refinement, fitted.collection, run),
+        missing_outputs=outputs.missing,
+        remarks=outputs.remarks,
+    )

@@ -1,0 +1,283 @@
+"""A model as a feed-forward network would export it, refined on the photographs it was made of."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+import pytest
+import tyro
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from smust3r_colmap.demo import DemoScene, demo_intrinsics
+from smust3r_colmap.errors import ConfigError, InputError
+from smust3r_colmap.evaluation import Evaluation, compare_trajectories, read_reference_sparse
+from smust3r_colmap.geometry.camera import pointmap_from_depth
+from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.progress import QuietReporter
+from smust3r_colmap.refine_command import Refine, run_refine
+from smust3r_colmap.refine_model import neighbouring_pairs
+from smust3r_colmap.summary import RunSummary
+
+FloatArray = npt.NDArray[np.float64]
+
+NUM_IMAGES = 8
+CAMERA = demo_intrinsics(320, 240)
+NETWORK_SIZE = (518, 392)
+"""518 wide, and the height rounded to a multiple of 14 from 388.5."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """Photographs of the room, the true cameras, and the model a network would have made of them."""
+
+    root: Path
+    truth: dict[str, FloatArray]
+    start: dict[str, FloatArray]
+
+    @property
+    def images(self) -> Path:
+        return self.root / "photos"
+
+    @property
+    def model(self) -> Path:
+        return self.root / "export"
+
+    def error_of(self, model: Path) -> Evaluation:
+        return compare_trajectories(read_reference_sparse(model), self.truth)
+
+
+def disturbed(world_from_cam: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Poses (N, 3, 4) with 2 cm and half a degree of noise in each axis."""
+    moved: FloatArray = world_from_cam.copy()
+    turns = Rotation.from_rotvec(rng.normal(0, np.deg2rad(0.5), (len(moved), 3))).as_matrix()
+    moved[:, :, :3] = moved[:, :, :3] @ turns
+    moved[:, :, 3] += rng.normal(0, 0.02, (len(moved), 3))
+    return moved
+
+
+def write_network_model(folder: Path, names: Sequence[str], world_from_cam: FloatArray, points: FloatArray) -> None:
+    """Text as VGGT-Long writes it: one camera per image, at network size; no empty lines; tracks of zeros."""
+    folder.mkdir()
+    rng = np.random.default_rng(1)
+    width, height = NETWORK_SIZE
+    cameras, images = [], []
+    for k, (name, pose) in enumerate(zip(names, invert_rigid(world_from_cam), strict=True), start=1):
+        focal = 0.75 * rng.normal(1, 0.01)
+        cameras.append(f"{k} PINHOLE {width} {height} {focal * 518} {focal * 392 * 4 / 3} {width / 2} {height / 2}")
+        x, y, z, w = Rotation.from_matrix(pose[:, :3]).as_quat()
+        images.append(f"{k} {w} {x} {y} {z} {pose[0, 3]} {pose[1, 3]} {pose[2, 3]} {k} {name}")
+    rows = [f"{k} {x} {y} {z} 90 90 90 0 0 0 0 0 0 0" for k, (x, y, z) in enumerate(points)]
+    for file, lines in (("cameras", cameras), ("images", images), ("points3D", rows)):
+        (folder / f"{file}.txt").write_text("".join(f"{line}\n" for line in lines))
+
+
+@pytest.fixture(scope="module")
+def export(tmp_path_factory: pytest.TempPathFactory) -> Export:
+    root = tmp_path_factory.mktemp("network")
+    scene = DemoScene()
+    world_from_cam = scene.camera_path(32)[:NUM_IMAGES]
+    names = [f"{k:03d}.png" for k in range(NUM_IMAGES)]
+    (root / "photos").mkdir()
+    points = []
+    for name, pose in zip(names, world_from_cam, strict=True):
+        rgb, depth = scene.render(pose, CAMERA)
+        Image.fromarray(rgb).save(root / "photos" / name)
+        points.append(pointmap_from_depth(depth, CAMERA, pose)[8::16, 8::16].reshape(-1, 3))
+    poor = disturbed(world_from_cam, np.random.default_rng(0))
+    write_network_model(root / "export", names, poor, np.concatenate(points).astype(np.float64))
+    return Export(
+        root=root,
+        truth=dict(zip(names, world_from_cam, strict=True)),
+        start=dict(zip(names, poor, strict=True)),
+    )
+
+
+def command(export: Export, output: Path) -> Refine:
+    return Refine(model=export.model, images=export.images, output=output, max_features=800, workers=1)
+
+
+def refined(wanted: Refine, warnings: io.StringIO | None = None) -> RunSummary:
+    return run_refine(wanted, QuietReporter(warnings or io.StringIO()))
+
+
+@pytest.fixture(scope="module")
+def result(export: Export, tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
+    return refined(command(export, tmp_path_factory.mktemp("refined") / "out"))
+
+
+def test_poses_of_a_network_become_several_times_better(export: Export, result: RunSummary) -> None:
+    """2 cm and 0.5 degrees an axis before; after, what photographs of 320 pixels allow."""
+    before = compare_trajectories(export.start, export.truth)
+    after = export.error_of(result.output / "sparse/0")
+    assert result.exit_code == 0
+    assert after.num_compared == NUM_IMAGES
+    assert 0 < after.position_rmse < before.position_rmse / 3
+    assert 0 < after.rotation_median_deg < before.rotation_median_deg / 3
+
+
+def test_the_result_has_one_camera_at_the_size_of_the_photographs(result: RunSummary) -> None:
+    (camera,) = pycolmap.Reconstruction(result.output / "sparse/0").cameras.values()
+    assert (camera.width, camera.height) == (320, 240)
+    assert camera.model.name == "SIMPLE_RADIAL"
+    assert camera.focal_length == pytest.approx(240, rel=0.05)
+
+
+def test_tracks_are_real_and_the_summary_counts_them(result: RunSummary) -> None:
+    model = pycolmap.Reconstruction(result.output / "sparse/0")
+    assert min(point.track.length() for point in model.points3D.values()) >= 2
+    (figures,) = json.loads((result.output / "summary.json").read_text())["refinements"]
+    assert figures["num_points"] == model.num_points3D() > 100
+    assert figures["steps"][0]["name"] == "triangulation"
+    adjustments = [step for step in figures["steps"] if "adjustment" in step["name"]]
+    assert adjustments[0]["error_after_px"] < adjustments[0]["error_before_px"]
+
+
+def test_the_model_and_the_database_go_together(result: RunSummary) -> None:
+    model = pycolmap.Reconstruction(result.output / "sparse/0")
+    with pycolmap.Database.open(result.output / "database.db") as database:
+        assert {image.image_id: image.name for image in database.read_all_images()} == {
+            image_id: image.name for image_id, image in model.images.items()
+        }
+        for image_id, image in model.images.items():
+            assert len(database.read_keypoints(image_id)) == image.num_points2D()
+
+
+def test_everything_that_was_assumed_is_in_the_summary(result: RunSummary) -> None:
+    remarks = "\n".join(json.loads((result.output / "summary.json").read_text())["model_remarks"])
+    assert "8 images without a line of observations" in remarks
+    assert "rescaled from 518x392 to 320x240 px" in remarks
+    assert "8 cameras with one image each became one" in remarks
+
+
+def test_the_files_are_those_of_a_reconstruction(result: RunSummary) -> None:
+    names = {path.name for path in result.output.iterdir()}
+    assert names >= {"points.ply", "scene.glb", "trajectory_tum.txt", "trajectory_stitched_tum.txt", "config.toml"}
+    assert not names & {"trainer", "dense"}
+
+
+def test_a_second_start_computes_nothing_and_writes_the_same(export: Export, result: RunSummary) -> None:
+    before = (result.output / "sparse/0/points3D.bin").read_bytes()
+    again = refined(command(export, result.output))
+    assert {stage.name for stage in again.stages if stage.reused} >= {"features", "refinement"}
+    assert (result.output / "sparse/0/points3D.bin").read_bytes() == before
+
+
+def test_a_model_without_points_is_refined_as_well(export: Export, result: RunSummary, tmp_path: Path) -> None:
+    """The features of the first run are taken along, for they are what takes long."""
+    model = tmp_path / "export"
+    shutil.copytree(export.model, model, ignore=shutil.ignore_patterns("points3D.txt"))
+    shutil.copytree(result.output / "work/features", tmp_path / "out/work/features")
+    with pycolmap.Database.open(tmp_path / "out/work/features/database.db") as database:
+        database.clear_matches()
+        database.clear_two_view_geometries()
+    (tmp_path / "out/work/lock").touch()
+    summary = refined(replace(command(export, tmp_path / "out"), model=model))
+    assert summary.exit_code == 0
+    before = compare_trajectories(export.start, export.truth)
+    assert export.error_of(tmp_path / "out/sparse/0").position_rmse < before.position_rmse / 3
+
+
+def test_poses_that_no_match_agrees_with_are_doubted_aloud(export: Export, result: RunSummary, tmp_path: Path) -> None:
+    """Camera centres where translations belong: the file looks as good as any."""
+    model = tmp_path / "export"
+    shutil.copytree(export.model, model)
+    lines = [line.split() for line in (model / "images.txt").read_text().splitlines()]
+    for words in lines:
+        words[5:8] = map(str, export.start[words[9]][:, 3])
+    (model / "images.txt").write_text("".join(f"{' '.join(words)}\n" for words in lines))
+    shutil.copytree(result.output / "work/features", tmp_path / "out/work/features")
+    (tmp_path / "out/work/lock").touch()
+    warnings = io.StringIO()
+    refined(replace(command(export, tmp_path / "out"), model=model), warnings)
+    assert "camera centres in place of translations" in warnings.getvalue()
+
+
+def test_photographs_without_a_feature_leave_the_model_as_it_was(export: Export, tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for name in sorted(export.truth)[:3]:
+        Image.new("RGB", (320, 240), (128, 128, 128)).save(photos / name)
+    summary = refined(replace(command(export, tmp_path / "out"), images=photos, text=True))
+    assert summary.exit_code == 3
+    assert any("has no tracks" in reason for reason in summary.weak_reasons)
+    assert any("5 of 8 files could not be used" in reason for reason in summary.weak_reasons)
+    found = compare_trajectories(read_reference_sparse(tmp_path / "out/sparse/0"), export.start)
+    assert found.num_compared == 3
+    assert found.position_max < 1e-6
+    assert (tmp_path / "out/sparse/0/images.txt").exists()
+    assert not (tmp_path / "out/database.db").exists()
+
+
+# --------------------------------------------------------------------------- refusals
+def test_the_model_is_not_overwritten_by_its_refinement(export: Export, tmp_path: Path) -> None:
+    shutil.copytree(export.model, tmp_path / "run/sparse/0")
+    wanted = replace(command(export, tmp_path / "run"), model=tmp_path / "run")
+    with pytest.raises(ConfigError, match=r"the model .*sparse/0 lies there and would be lost"):
+        refined(wanted)
+
+
+def test_results_are_not_written_among_the_images(export: Export) -> None:
+    with pytest.raises(ConfigError, match="lies inside the image folder"):
+        refined(command(export, export.images / "out"))
+
+
+def test_names_with_blanks_are_refused_before_any_work_when_text_is_wanted(export: Export, tmp_path: Path) -> None:
+    shutil.copytree(export.images, tmp_path / "photos")
+    (tmp_path / "photos/000.png").rename(tmp_path / "photos/00 0.png")
+    shutil.copytree(export.model, tmp_path / "export")
+    lines = (tmp_path / "export/images.txt").read_text().replace("000.png", "00 0.png")
+    (tmp_path / "export/images.txt").write_text(lines)
+    wanted = Refine(model=tmp_path / "export", images=tmp_path / "photos", output=tmp_path / "out", text=True)
+    with pytest.raises(InputError, match=r"'00 0.png': COLMAP's text format cannot hold"):
+        refined(wanted)
+    assert not (tmp_path / "out/work/features").exists()
+
+
+@pytest.mark.parametrize("tolerance", [0.0, -0.1, 0.3])
+def test_a_tolerance_that_means_nothing_is_refused(tolerance: float) -> None:
+    with pytest.raises(ConfigError, match=r"--pose-tolerance .* above 0 up to 0.2"):
+        Refine(model=Path("m"), images=Path("i"), output=Path("o"), pose_tolerance=tolerance)
+
+
+def test_flags_reach_the_settings_of_the_run() -> None:
+    flags = "m --images i --output o --max-features 5 --track-neighbours 3 --text --trainer --workers 2 --seed 4"
+    config = tyro.cli(Refine, args=flags.split()).run_config()
+    assert (config.classical.max_features, config.refinement.track_neighbours) == (5, 3)
+    assert (config.output.text, config.output.trainer, config.output.dense) == (True, True, False)
+    assert (config.workers, config.seed) == (2, 4)
+
+
+# ------------------------------------------------------------------- pairs without points
+def looking(directions_deg: Sequence[float], positions: Sequence[float]) -> FloatArray:
+    """``cam_from_world`` (N, 3, 4) of cameras on the x axis that look away from z by an angle."""
+    world_from_cam = np.zeros((len(positions), 3, 4))
+    world_from_cam[:, :, :3] = Rotation.from_euler("y", np.asarray(directions_deg)[:, None], degrees=True).as_matrix()
+    world_from_cam[:, 0, 3] = positions
+    return invert_rigid(world_from_cam)
+
+
+def test_few_cameras_are_all_paired() -> None:
+    assert neighbouring_pairs(looking([0, 90, 180], [0, 1, 2]), per_image=1, exhaustive_below=3) == (
+        (0, 1),
+        (0, 2),
+        (1, 2),
+    )
+
+
+def test_cameras_are_paired_with_their_nearest() -> None:
+    pairs = neighbouring_pairs(looking([0] * 5, [0, 1, 2.1, 3.3, 4.6]), per_image=1, exhaustive_below=2)
+    assert pairs == ((0, 1), (1, 2), (2, 3), (3, 4))
+
+
+def test_cameras_that_look_elsewhere_are_passed_over() -> None:
+    pairs = neighbouring_pairs(looking([0, 90, 20, 95], [0, 0.1, 1, 2]), per_image=1, exhaustive_below=2)
+    assert pairs == ((0, 2), (1, 3))
