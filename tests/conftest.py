@@ -5,8 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from finished_runs import Example
 
 
 @pytest.fixture(scope="session")
@@ -25,3 +29,11 @@ def data_dir() -> Callable[[str], Path]:
         return root / name
 
     return find
+
+
+@pytest.fixture(scope="session")
+def finished_example(tmp_path_factory: pytest.TempPathFactory) -> Example:
+    """A small finished run; it is only read, tests that change something copy it."""
+    from finished_runs import make_finished_run  # noqa: PLC0415  (heavy, and few tests need it)
+
+    return make_finished_run(tmp_path_factory.mktemp("finished"))

@@ -1,0 +1,154 @@
+"""A finished run, opened again to write its results in other formats; nothing is computed anew.
+
+What a run stitched, refined and fused lies in its ``work`` folder; ``work/finished.json``, which a run writes last,
+says which of it belongs together. The next module to read is ``exports``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from smust3r_colmap.errors import CollectionError, ImageError, InputError, RunDirectoryError
+from smust3r_colmap.importers.image_folder import ImportRecord
+from smust3r_colmap.products import DepthMaps, Scene
+from smust3r_colmap.refinement.task import DATABASE_FILE, MODEL_FOLDER
+from smust3r_colmap.run_directory import RunDirectory, read_json, storage_errors, write_json
+from smust3r_colmap.stored_depth import StoredDepthMaps
+from smust3r_colmap.stored_scene import read_scenes
+
+FINISHED_FILE = "finished.json"
+SCENE_STAGE, STITCHED_STAGE, REFINED_STAGE, IMPORT_STAGE = "scene", "stitched", "refined", "import"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FinishedRun:
+    """All that formats are written from.
+
+    Args:
+        output: the folder that results go to, in most cases the run's own.
+        native_log: for the messages of native code.
+        images: the folder of the original images.
+        scenes: largest first, with their clouds.
+        models: one per scene, folder of the COLMAP model with tracks, or None where there are none.
+        database: that goes with the models, or None.
+        maps: depth of the images, or None.
+    """
+
+    output: Path
+    native_log: Path
+    images: Path
+    scenes: tuple[Scene, ...]
+    models: tuple[Path | None, ...]
+    database: Path | None
+    maps: DepthMaps | None
+
+    def sparse_model(self, number: int) -> Path:
+        """Where the COLMAP model number ``number`` goes."""
+        return self.output / "sparse" / str(number)
+
+
+def write_finished(run: RunDirectory, finished: FinishedRun) -> None:
+    """Say that the run is complete, where its images are and which parts it has."""
+    facts = {
+        "images": str(finished.images.resolve()),
+        "with_tracks": [model is not None for model in finished.models],
+        "with_maps": finished.maps is not None,
+    }
+    write_json(run.work / FINISHED_FILE, facts)
+
+
+def forget_finished(run: RunDirectory) -> None:
+    """To be called before the stages change: until the run ends again, they do not belong together."""
+    with storage_errors(run.work):
+        (run.work / FINISHED_FILE).unlink(missing_ok=True)
+
+
+def check_is_finished(root: Path) -> None:
+    """Refuse a folder that holds no finished run, before it is locked and thereby touched.
+
+    Raises:
+        InputError: there is no such folder, or no finished run in it.
+    """
+    if not root.is_dir():
+        raise InputError(f"{root}: there is no such folder; give the output folder of reconstruct")
+    if not (root / "work" / "lock").is_file():
+        raise InputError(f"{root}: is no run of this program, for it has no work folder of one")
+    if not (root / "work" / FINISHED_FILE).is_file():
+        raise InputError(f"{root}: the run is not finished; start the same reconstruct command again, it goes on")
+
+
+def open_finished(run: RunDirectory, *, images: Path | None = None, output: Path | None = None) -> FinishedRun:
+    """What the run has stored.
+
+    Args:
+        run: held by this process, so that nobody changes it meanwhile; see ``check_is_finished``.
+        images: the folder of the images, where it has moved since.
+        output: where results shall go instead of the run's folder.
+
+    Raises:
+        RunDirectoryError: the run was made by another version.
+        StorageError: a stage cannot be read.
+    """
+    facts = read_json(run.work / FINISHED_FILE)
+    try:
+        images_then, with_tracks, with_maps = Path(facts["images"]), facts["with_tracks"], facts["with_maps"]
+    except (KeyError, TypeError) as error:
+        raise RunDirectoryError(
+            f"{run.work / FINISHED_FILE}: was written by another version; start the same reconstruct command again"
+        ) from error
+    refined = run.work / REFINED_STAGE
+    return FinishedRun(
+        output=run.root if output is None else output,
+        native_log=run.native_log,
+        images=images_then if images is None else images,
+        scenes=read_scenes(run.work / SCENE_STAGE),
+        models=tuple(refined / str(k) / MODEL_FOLDER if has else None for k, has in enumerate(with_tracks)),
+        database=refined / DATABASE_FILE if any(with_tracks) else None,
+        maps=StoredDepthMaps(run.work / STITCHED_STAGE) if with_maps else None,
+    )
+
+
+# ------------------------------------------------------------------------------ images
+def check_images(run: RunDirectory, finished: FinishedRun) -> None:
+    """Refuse images that are not those the run was made of: their pixels would not fit its cameras.
+
+    A file of the same size that was touched since is compared by its content.
+
+    Raises:
+        CollectionError: the folder is gone.
+        ImageError: a file is gone, or another one now.
+    """
+    if not finished.images.is_dir():
+        raise CollectionError(f"{finished.images}: the images are not there any more; say with --images where they are")
+    stored = read_json(run.work / IMPORT_STAGE / "records.json")
+    known = {record.name: record for record in map(ImportRecord.from_json, stored)}
+    for name in _names(finished.scenes):
+        _check_image(finished.images / name, known[name])
+
+
+def _names(scenes: Iterable[Scene]) -> list[str]:
+    return list(dict.fromkeys(name for scene in scenes for name in scene.image_names))
+
+
+def _check_image(path: Path, record: ImportRecord) -> None:
+    try:
+        status = path.stat()
+        if (status.st_size, status.st_mtime_ns) == (record.size_bytes, record.mtime_ns):
+            return
+        same = status.st_size == record.size_bytes and _digest(path) == record.digest
+    except FileNotFoundError as error:
+        raise ImageError(f"{record.name}: is not in {path.parent} any more; say with --images where it is") from error
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
+    if not same:
+        raise ImageError(
+            f"{path}: has changed since the run ({record.size_bytes} bytes then, {status.st_size} now); "
+            "put the old file back, or reconstruct again"
+        )
+
+
+def _digest(path: Path) -> str:
+    return hashlib.blake2b(path.read_bytes(), digest_size=20).hexdigest()
