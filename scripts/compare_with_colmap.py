@@ -1,6 +1,7 @@
 """Compare this program with COLMAP's two mappers on image sets whose cameras are known.
 
-    python scripts/compare_with_colmap.py castle_p30 kitti_a --json comparison.json
+    python scripts/compare_with_colmap.py castle_p30 kitti_a --stages --markdown comparison.md --json comparison.json
+    python scripts/compare_with_colmap.py kitchen_rgbd --reuse --rerun-ours --workers 1 2
 
 A data set is a folder, or the name of one in $SMUST3R_DATA (default: ../shared/data beside the
 repository), with ``images/`` and a truth: ``poses.txt``, ``transforms.json`` or
@@ -13,6 +14,11 @@ most 1024 pixels with 6000 features; up to 50 images are matched exhaustively, l
 with their 10 next and quadratically spaced neighbours and some 80 spread images exhaustively.
 Accuracy is that of the largest model after a Sim(3) fit, see ``smust3r_colmap.evaluation``. Nobody
 is told the calibration: a principal point off the centre then leaves a rotation error for all.
+
+Mapping is everything after features and matching but depth maps; COLMAP's includes the start of its
+process, about a second. Jumps are neighbours in order of name with more than 90 degrees or ten
+median steps between them, where the truth has none: a fold, or parts put together wrongly. What is
+measured and which targets it is held against stands in ``comparison_figures``.
 """
 
 from __future__ import annotations
@@ -20,98 +26,77 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
-from itertools import combinations
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import pycolmap
+from comparison_figures import (
+    GLOBAL,
+    INCREMENTAL,
+    Cost,
+    Dataset,
+    Result,
+    costs_by_stage,
+    figures_of,
+    untrue_jumps,
+)
+from comparison_report import as_json, render_markdown, render_stages, render_table
+from plot_trajectory import read_tum_by_name
 
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.evaluation import (
     Evaluation,
+    Trajectory,
     compare_trajectories,
     read_poses_txt,
     read_reference_sparse,
     read_transforms_json,
 )
+from smust3r_colmap.execution import usable_cores
+from smust3r_colmap.importers.image_folder import natural_key
 
 DATA = Path(os.environ.get("SMUST3R_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 SUBSET_FILE = "subset_every5.txt"
+COLMAP_SCRIPT = Path(__file__).with_name("comparison_colmap.py")
 
 # Segments of 60 with 30 shared images are the paper's; sets of some fifty images or fewer need
 # shorter ones, or there would be nothing to stitch.
 SHORT_SEGMENTS = {"castle_p30", "fountain_p11", "fox", "kitti_a", "sacre_coeur"}
+# Neighbours in order of name are no neighbours in space.
+UNORDERED = {"sacre_coeur"}
 
-SIFT_IMAGE_SIZE = 1024
-SIFT_FEATURES = 6000
-EXHAUSTIVE_UP_TO = 50
-SEQUENTIAL_OVERLAP = 10
-SPREAD_IMAGES = 80
-
-OUR_MAPPING_STAGES = ("mapping", "mapping without the global mapper", "calibration", "alignment")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cost:
-    """What a child process and its own children took."""
-
-    cpu_s: float
-    wall_s: float
-    peak_mib: float
-    exit_code: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class Dataset:
-    """Images and their known cameras; ``unit`` is that of the truth."""
-
-    name: str
-    images: Path
-    num_images: int
-    truth: dict[str, Any]
-    unit: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class Result:
-    """A row of the table."""
-
-    method: str
-    costs: dict[str, Cost]
-    registered_largest: int
-    registered_all: int
-    num_models: int
-    evaluation: Evaluation | None
-    remark: str
+STAGE_FILES = {"chain": "trajectory_without_loops_tum.txt", "loops": "trajectory_stitched_tum.txt"}
+"""Our trajectories before the result; a run without loops, or without refinement, does not write them."""
+LAST_STAGE = "triangulation and adjustment"
 
 
 def main() -> int:
     """Compare all data sets named on the command line; the exit code is 1 when a process failed."""
-    if sys.argv[1:2] == ["--stage"]:
-        stage, images, work = sys.argv[2:]
-        COLMAP_STAGES[stage](Path(images), Path(work))
-        return 0
-    arguments = parse_arguments()
-    report: dict[str, Any] = {}
-    failed = False
+    arguments = parse_arguments(None)
+    compared: list[tuple[Dataset, list[Result]]] = []
     for name in arguments.datasets:
         dataset = open_dataset(name, arguments.output, all_images=arguments.all_images)
         results = list(run_methods(dataset, arguments))
+        compared.append((dataset, results))
         print(render_table(dataset, results), flush=True)
-        report[dataset.name] = [as_json(result) for result in results]
-        failed |= any(cost.exit_code for result in results for cost in result.costs.values())
+        for ours in (result for result in results if result.stages):
+            print(render_stages(dataset, ours), flush=True)
         if arguments.json:
+            report = {dataset.name: as_json(dataset, results) for dataset, results in compared}
             arguments.json.write_text(json.dumps(report, indent=1), encoding="utf-8")
-    return int(failed)
+        if arguments.markdown:
+            arguments.markdown.write_text(render_markdown(compared), encoding="utf-8")
+    return int(any(cost.exit_code for _, results in compared for one in results for cost in one.costs.values()))
 
 
-def parse_arguments() -> argparse.Namespace:
+def parse_arguments(words: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("datasets", nargs="+", metavar="DATASET", help="a folder, or its name in $SMUST3R_DATA")
@@ -119,14 +104,33 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--segment-length", type=int, help="default: 12 for the short sets, otherwise 60")
     parser.add_argument("--overlap", type=int, help="default: half of the segment length")
     parser.add_argument("--all-images", action="store_true", help=f"use all images where there is a {SUBSET_FILE}")
+    parser.add_argument(
+        "--cameras",
+        choices=["auto", "single"],
+        default="auto",
+        help="for COLMAP: what it makes of EXIF, without it a camera per image; or one for all (%(default)s)",
+    )
     parser.add_argument("--skip-ours", action="store_true")
     parser.add_argument("--skip-incremental", action="store_true")
     parser.add_argument("--skip-global", action="store_true")
     parser.add_argument(
+        "--workers", type=int, nargs="+", metavar="N", help="run ours once with each of these numbers of processes"
+    )
+    parser.add_argument("--ours-name", default="ours", help="folder of our runs beside COLMAP's (%(default)s)")
+    parser.add_argument(
+        "--flags", type=shlex.split, default=[], metavar="TEXT", help="for ours, such as --flags='--no-dense'"
+    )
+    parser.add_argument("--stages", action="store_true", help="also what each of our stages does to the cameras")
+    parser.add_argument(
         "--reuse", action="store_true", help="take what an earlier comparison finished from the working folder"
     )
+    parser.add_argument("--rerun-ours", action="store_true", help="with --reuse: take only COLMAP's part")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures there, too")
-    return parser.parse_args()
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables there, too, all sets in one")
+    arguments = parser.parse_args(words)
+    if arguments.rerun_ours and not arguments.reuse:
+        parser.error("--rerun-ours says what --reuse leaves out; give both, or neither to run everything")
+    return arguments
 
 
 # ----------------------------------------------------------------------------- data
@@ -139,13 +143,14 @@ def open_dataset(name: str, output: Path, *, all_images: bool) -> Dataset:
     subset = folder / SUBSET_FILE
     if subset.exists() and not all_images:
         images = link_images(images, subset.read_text(encoding="utf-8").split(), output / folder.resolve().name)
-    present = {path.relative_to(images).as_posix() for path in images.rglob("*") if path.is_file()}
+    files = (path.relative_to(images).as_posix() for path in images.rglob("*") if path.is_file())
+    names = sorted(files, key=natural_key)
     truth, unit = read_truth(folder)
     return Dataset(
         name=folder.resolve().name,
         images=images,
-        num_images=len(present),
-        truth={image: pose for image, pose in truth.items() if image in present},
+        names=tuple(names),
+        truth={image: pose for image, pose in truth.items() if image in set(names)},
         unit=unit,
     )
 
@@ -175,78 +180,82 @@ def run_methods(dataset: Dataset, arguments: argparse.Namespace) -> Iterator[Res
     """Run what was asked for, one method after the other."""
     work = arguments.output / dataset.name
     if not arguments.skip_ours:
-        yield run_ours(dataset, work / "ours", arguments)
+        for workers in arguments.workers or [0]:
+            yield run_ours(dataset, work, arguments, workers=workers)
     mappers = [name for name in ("incremental", "global") if not getattr(arguments, f"skip_{name}")]
     if not mappers:
         return
-    colmap = work / "colmap"
+    colmap = work / ("colmap" if arguments.cameras == "auto" else "colmap_single")
     if not arguments.reuse:
         shutil.rmtree(colmap, ignore_errors=True)
     colmap.mkdir(parents=True, exist_ok=True)
-    shared = {stage: run_colmap_stage(stage, dataset.images, colmap) for stage in ("features", "matching")}
+    shared = {
+        stage: run_colmap_stage(stage, dataset.images, colmap, arguments.cameras) for stage in ("features", "matching")
+    }
     for name in mappers:
-        costs = {**shared, "mapping": run_colmap_stage(name, dataset.images, colmap)}
-        yield judge(f"COLMAP {name}", dataset, colmap / name, costs)
+        costs = {**shared, "mapping": run_colmap_stage(name, dataset.images, colmap, arguments.cameras)}
+        yield judge({"incremental": INCREMENTAL, "global": GLOBAL}[name], dataset, colmap / name, costs)
 
 
-def run_ours(dataset: Dataset, output: Path, arguments: argparse.Namespace) -> Result:
+def run_ours(dataset: Dataset, work: Path, arguments: argparse.Namespace, *, workers: int) -> Result:
     """``smust3r-colmap reconstruct`` from scratch, or what an earlier comparison left with --reuse."""
     length = arguments.segment_length or (12 if dataset.name in SHORT_SEGMENTS else 60)
     overlap = arguments.overlap or length // 2
-    record = output.parent / "ours.json"
-    if not (arguments.reuse and record.exists()):
-        measure_ours(dataset, output, record, length=length, overlap=overlap)
+    settings = ["--segment-length", str(length), "--overlap", str(overlap), *arguments.flags]
+    label = " ".join([f"{arguments.ours_name} l={length} p={overlap}", *arguments.flags])
+    folder = arguments.ours_name
+    if workers:
+        settings += ["--workers", str(workers)]
+        label += f" workers={workers}"
+        folder += f"_workers{workers}"
+    output, record = work / folder, work / f"{folder}.json"
+    if arguments.rerun_ours or not (arguments.reuse and record.exists()):
+        measure_ours(dataset, output, record, settings)
     cost = Cost(**json.loads(record.read_text(encoding="utf-8")))
-    return judge(f"ours l={length} p={overlap}", dataset, output / "sparse", costs_by_stage(cost, output))
+    summary = output / "summary.json"
+    costs = {"rest": cost}
+    if summary.exists():
+        costs = costs_by_stage(cost, json.loads(summary.read_text(encoding="utf-8"))["stages"])
+    result = judge(label, dataset, output / "sparse", costs)
+    stages = effect_of_stages(dataset, output, result) if arguments.stages else {}
+    return replace(result, workers=workers or usable_cores(), stages=stages)
 
 
-def measure_ours(dataset: Dataset, output: Path, record: Path, *, length: int, overlap: int) -> None:
+def measure_ours(dataset: Dataset, output: Path, record: Path, settings: list[str]) -> None:
     """Run the command on an empty output folder and write down what it took."""
     shutil.rmtree(output, ignore_errors=True)
     output.parent.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "smust3r_colmap", "reconstruct", str(dataset.images), "--output", str(output)]
-    settings = ["--segment-length", str(length), "--overlap", str(overlap), "--quiet"]
-    cost = run_child([*command, *settings], output.parent / "ours.log")
+    cost = run_child([*command, *settings, "--quiet"], output.with_name(f"{output.name}.log"))
     # 3 is the exit code of a run that finished with a weak result, which the table shows anyway.
-    cost = Cost(**{**asdict(cost), "exit_code": 0 if cost.exit_code == 3 else cost.exit_code})
+    cost = replace(cost, exit_code=0 if cost.exit_code == 3 else cost.exit_code)
     record.write_text(json.dumps(asdict(cost)), encoding="utf-8")
 
 
-def costs_by_stage(cost: Cost, output: Path) -> dict[str, Cost]:
-    """The whole cost, parted into what COLMAP has too and the rest (depth maps, fusion, files)."""
-    summary = output / "summary.json"
-    if not summary.exists():
-        return {"rest": cost}
-    stages = json.loads(summary.read_text(encoding="utf-8"))["stages"]
-    costs = {}
-    for name in ("features", "matching", "mapping"):
-        # Mapping is everything up to one model: the segments, their common calibration, their alignment.
-        parts = [name] if name != "mapping" else [*OUR_MAPPING_STAGES]
-        chosen = [stage for stage in stages if stage["name"] in parts]
-        costs[name] = replace(
-            cost,
-            cpu_s=sum(stage["cpu_s"] for stage in chosen),
-            wall_s=sum(stage["wall_s"] for stage in chosen),
-            exit_code=0,
-        )
-    named = list(costs.values())
-    costs["rest"] = replace(
-        cost,
-        cpu_s=max(0.0, cost.cpu_s - sum(one.cpu_s for one in named)),
-        wall_s=max(0.0, cost.wall_s - sum(one.wall_s for one in named)),
-    )
-    return costs
+def effect_of_stages(dataset: Dataset, output: Path, result: Result) -> dict[str, Evaluation]:
+    """How far our cameras are from the truth after each stage that the run wrote down, and in the end."""
+    effects = {}
+    for stage, file in STAGE_FILES.items():
+        if (output / file).exists():
+            effects[stage] = compare_trajectories(read_tum_by_name(output, output / file), dataset.truth)
+    if result.evaluation is not None:
+        refined = STAGE_FILES["loops"] in {path.name for path in output.iterdir()}
+        effects[LAST_STAGE if refined else "loops"] = result.evaluation
+    return effects
 
 
 def judge(method: str, dataset: Dataset, sparse: Path, costs: dict[str, Cost]) -> Result:
-    """Compare the largest model in a folder of models with the truth."""
+    """Measure the largest model in a folder of models, and compare it with the truth."""
     folders = [folder for folder in sorted(sparse.glob("*")) if any(folder.glob("images.*"))]
-    models = sorted((read_reference_sparse(folder) for folder in folders), key=len, reverse=True)
+    models = sorted(((read_reference_sparse(folder), folder) for folder in folders), key=lambda one: -len(one[0]))
     remarks = [f"{stage}: exit code {cost.exit_code}" for stage, cost in costs.items() if cost.exit_code]
-    evaluation = None
+    evaluation, figures = None, None
+    largest: Trajectory = {}
     if models:
+        largest, folder = models[0]
+        figures = figures_of(pycolmap.Reconstruction(folder))
         try:
-            evaluation = compare_trajectories(models[0], dataset.truth)
+            evaluation = compare_trajectories(largest, dataset.truth)
         except DegenerateAlignmentError as error:
             remarks.append(str(error))
     else:
@@ -254,71 +263,27 @@ def judge(method: str, dataset: Dataset, sparse: Path, costs: dict[str, Cost]) -
     return Result(
         method=method,
         costs=costs,
-        registered_largest=len(models[0]) if models else 0,
-        registered_all=len({name for model in models for name in model}),
+        registered_largest=len(largest),
+        registered_all=len({name for trajectory, _ in models for name in trajectory}),
         num_models=len(models),
+        figures=figures,
         evaluation=evaluation,
+        jumps=None if dataset.name in UNORDERED else untrue_jumps(largest, dataset.truth, dataset.names),
         remark="; ".join(remarks),
+        workers=usable_cores(),
+        stages={},
     )
 
 
 # ------------------------------------------------------------------ COLMAP's stages
-def run_colmap_stage(stage: str, images: Path, work: Path) -> Cost:
+def run_colmap_stage(stage: str, images: Path, work: Path, cameras: str) -> Cost:
     """Run a stage in a child process, unless the working folder has it."""
     record = work / f"{stage}.json"
     if not record.exists():
-        command = [sys.executable, __file__, "--stage", stage, str(images), str(work)]
+        command = [sys.executable, str(COLMAP_SCRIPT), stage, str(images), str(work), cameras]
         cost = run_child(command, work / f"{stage}.log")
         record.write_text(json.dumps(asdict(cost)), encoding="utf-8")
     return Cost(**json.loads(record.read_text(encoding="utf-8")))
-
-
-def extract_features(images: Path, work: Path) -> None:
-    """SIFT of all images; cameras are shared where COLMAP thinks they are."""
-    options = pycolmap.FeatureExtractionOptions(max_image_size=SIFT_IMAGE_SIZE)
-    options.sift.max_num_features = SIFT_FEATURES
-    (work / "database.db").unlink(missing_ok=True)
-    pycolmap.extract_features(work / "database.db", images, extraction_options=options)
-
-
-def match_features(images: Path, work: Path) -> None:
-    """All pairs of a small set; neighbours and spread images of a sequence."""
-    names = sorted(path.relative_to(images).as_posix() for path in images.rglob("*") if path.is_file())
-    if len(names) <= EXHAUSTIVE_UP_TO:
-        pycolmap.match_exhaustive(work / "database.db")
-        return
-    neighbours = pycolmap.SequentialPairingOptions(overlap=SEQUENTIAL_OVERLAP, quadratic_overlap=True)
-    pycolmap.match_sequential(work / "database.db", pairing_options=neighbours)
-    spread = names[:: -(-len(names) // SPREAD_IMAGES)]
-    pair_list = work / "pairs.txt"
-    pair_list.write_text("".join(f"{a} {b}\n" for a, b in combinations(spread, 2)), encoding="utf-8")
-    pairs = pycolmap.ImportedPairingOptions(match_list_path=pair_list)
-    pycolmap.match_image_pairs(work / "database.db", pairing_options=pairs)
-
-
-def map_incrementally(images: Path, work: Path) -> None:
-    """COLMAP's incremental mapper with its defaults."""
-    pycolmap.incremental_mapping(work / "database.db", images, emptied(work / "incremental"))
-
-
-def map_globally(images: Path, work: Path) -> None:
-    """COLMAP's global mapper (GLOMAP) with its defaults."""
-    pycolmap.global_mapping(work / "database.db", images, emptied(work / "global"))
-
-
-def emptied(folder: Path) -> Path:
-    """The folder without what an interrupted run may have left in it."""
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    return folder
-
-
-COLMAP_STAGES: dict[str, Callable[[Path, Path], None]] = {
-    "features": extract_features,
-    "matching": match_features,
-    "incremental": map_incrementally,
-    "global": map_globally,
-}
 
 
 def run_child(command: list[str], log: Path) -> Cost:
@@ -336,53 +301,6 @@ def run_child(command: list[str], log: Path) -> Cost:
         peak_mib=usage.ru_maxrss / 1024,  # ru_maxrss is in KiB on Linux
         exit_code=child.returncode,
     )
-
-
-# --------------------------------------------------------------------------- report
-def render_table(dataset: Dataset, results: list[Result]) -> str:
-    """One line per method."""
-    header = ["method", "images", "models", f"rms {dataset.unit}", "% extent", "rot deg med", "mean"]
-    header += ["CPU/wall s feat", "match", "map", "rest", "all", "MiB", ""]
-    lines = [header, *(table_line(result, dataset.num_images) for result in results)]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(header))]
-    rows = ["  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]
-    return "\n".join(
-        [f"\n{dataset.name}: {dataset.num_images} images, {len(dataset.truth)} with a known camera", *rows]
-    )
-
-
-def table_line(result: Result, num_images: int) -> list[str]:
-    """The cells of a method: images of the largest model / of all models / that there are."""
-    found = result.evaluation
-    accuracy = ["-"] * 4
-    if found is not None:
-        accuracy = [f"{found.position_rmse:.4g}", f"{found.position_rmse_percent:.3g}"]
-        accuracy += [f"{found.rotation_median_deg:.3g}", f"{found.rotation_mean_deg:.3g}"]
-    costs = result.costs
-    stages = [
-        f"{costs[stage].cpu_s:.0f}/{costs[stage].wall_s:.0f}" if stage in costs else "-"
-        for stage in ("features", "matching", "mapping", "rest")
-    ]
-    return [
-        result.method,
-        f"{result.registered_largest}/{result.registered_all}/{num_images}",
-        str(result.num_models),
-        *accuracy,
-        *stages,
-        f"{sum(cost.cpu_s for cost in costs.values()):.0f}/{sum(cost.wall_s for cost in costs.values()):.0f}",
-        f"{max(cost.peak_mib for cost in costs.values()):.0f}",
-        result.remark,
-    ]
-
-
-def as_json(result: Result) -> dict[str, Any]:
-    """Everything that is known of a method, with numbers and strings only."""
-    found = result.evaluation
-    record = {**vars(result), "costs": {stage: asdict(cost) for stage, cost in result.costs.items()}}
-    if found is not None:
-        facts = {**vars(found), "position_rmse_percent": found.position_rmse_percent}
-        record["evaluation"] = {key: value for key, value in facts.items() if key != "reference_from_estimated"}
-    return record
 
 
 if __name__ == "__main__":
