@@ -1,4 +1,4 @@
-"""The command line: ``reconstruct``, ``demo`` and ``doctor``; ``weights`` is in ``weights_command``.
+"""The command line: ``reconstruct``, ``demo`` and ``doctor``; the other commands are in ``*_command``.
 
 Flags, files and exit codes live here and nowhere else; so do printing and the set-up of logging.
 Settings come from the defaults, then the TOML file, then the flags. What a command needs is
@@ -26,8 +26,11 @@ from smust3r_colmap import __version__
 from smust3r_colmap.config import ClassicalConfig, RunConfig
 from smust3r_colmap.config_file import flags_from_settings, read_settings
 from smust3r_colmap.errors import ConfigError, InputError, SmustrError
+from smust3r_colmap.export_command import Export, run_export
 from smust3r_colmap.progress import Reporter, reporter_for
+from smust3r_colmap.refine_command import Refine, run_refine
 from smust3r_colmap.summary import EXIT_GOOD, EXIT_WEAK, RunSummary
+from smust3r_colmap.validate_command import Validate, run_validate
 from smust3r_colmap.weights_command import WeightsAction, WeightsCommand, run_weights
 
 EXIT_FAILED = 1
@@ -90,7 +93,7 @@ class Doctor:
     """Print the traceback of an unexpected error."""
 
 
-Command = Reconstruct | Demo | Doctor | WeightsCommand
+Command = Reconstruct | Refine | Export | Validate | Demo | Doctor | WeightsCommand
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -152,13 +155,23 @@ def _run_guarded(command: Command) -> int:
 
 
 def _run(command: Command) -> int:
-    if isinstance(command, Reconstruct):
-        return _run_reconstruct(command)
-    if isinstance(command, Demo):
-        return _run_demo(command)
-    if isinstance(command, WeightsAction):
-        return _run_weights(command)
-    return _run_doctor(command)
+    match command:
+        case Reconstruct():
+            exit_code = _run_reconstruct(command)
+        case Refine():
+            exit_code = _run_refine(command)
+        case Export():
+            with _reporting(quiet=command.quiet, verbose=command.verbose) as reporter:
+                exit_code = run_export(command, reporter)
+        case Validate():
+            exit_code = run_validate(command)
+        case Demo():
+            exit_code = _run_demo(command)
+        case Doctor():
+            exit_code = _run_doctor(command)
+        case _:
+            exit_code = _run_weights(command)
+    return exit_code
 
 
 def _run_reconstruct(command: Reconstruct) -> int:
@@ -166,6 +179,13 @@ def _run_reconstruct(command: Reconstruct) -> int:
 
     with _reporting(quiet=command.quiet, verbose=command.verbose) as reporter:
         summary = reconstruct(command.images, command.output, command.settings, fresh=command.fresh, reporter=reporter)
+        _tell(summary, reporter, quiet=command.quiet)
+        return summary.exit_code
+
+
+def _run_refine(command: Refine) -> int:
+    with _reporting(quiet=command.quiet, verbose=command.verbose) as reporter:
+        summary = run_refine(command, reporter)
         _tell(summary, reporter, quiet=command.quiet)
         return summary.exit_code
 

@@ -23,6 +23,8 @@ LoopKernel = Literal["cauchy", "gnc", "none"]
 AlignmentSource = Literal["auto", "tracks", "pointmaps"]
 ConfidenceWeighting = Literal["relative", "paper", "off"]
 RobustKernel = Literal["cauchy", "tukey", "huber"]
+TrackSource = Literal["features", "pointmaps", "both"]
+MeshMethod = Literal["none", "poisson", "tsdf"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,11 +183,59 @@ class FusionConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RefinementConfig:
+    """Real tracks, triangulation and bundle adjustment of the stitched model."""
+
+    refine: bool = True
+    """Find tracks across the whole scene and adjust cameras and points to them, where that makes the model better."""
+    tracks: TrackSource = "features"
+    """Where tracks come from: SIFT features, the backbone's pointmaps (for scenes where SIFT fails), or both."""
+    track_neighbours: int = 12
+    """Images that each image is matched with for tracks, chosen by how much of the same surface the stitched
+    geometry says they see; the pairs that the segments have matched already cost nothing more."""
+    principal_point: bool = True
+    """Let the principal point leave the middle of the image where two halves of the points agree on where it is."""
+    complete: bool = False
+    """Let COLMAP's incremental mapper try the images that got no pose, on the adjusted model."""
+
+    def __post_init__(self) -> None:
+        if self.track_neighbours < 1:
+            raise ConfigError(f"--track-neighbours {self.track_neighbours}: must be at least 1")
+
+
+@dataclass(frozen=True, kw_only=True)
 class OutputConfig:
     """What is written."""
 
     text: bool = False
     """Write the COLMAP model as .txt beside the .bin files."""
+    trainer: bool = True
+    """Write OUT/trainer, for splat and NeRF trainers: undistorted images, model, points, depth."""
+    trainer_scales: str = ""
+    """Smaller copies of the trainer's images, such as 2,4,8 for images_2, images_4 and images_8."""
+    dense: bool = True
+    """Write OUT/dense, COLMAP's workspace of depth and normal maps, and the fused cloud."""
+    mesh: MeshMethod = "none"
+    """Also make a mesh of the dense workspace: poisson closes holes, tsdf keeps to what was seen."""
+
+    def __post_init__(self) -> None:
+        if self.mesh != "none" and not self.dense:
+            raise ConfigError(f"--mesh {self.mesh} is made of the dense workspace; leave --no-dense out")
+        _ = self.trainer_factors
+
+    @property
+    def trainer_factors(self) -> tuple[int, ...]:
+        """``trainer_scales`` as numbers."""
+        factors = [part.strip() for part in self.trainer_scales.split(",") if part.strip()]
+        if not all(part.isdecimal() and int(part) > 1 for part in factors):
+            raise ConfigError(f"--trainer-scales {self.trainer_scales!r}: whole numbers above 1, such as 2,4,8")
+        return tuple(int(part) for part in factors)
+
+    @property
+    def large_formats(self) -> tuple[str, ...]:
+        """The formats of ``exports`` that are wanted and take long."""
+        wanted = (("trainer", self.trainer), ("dense", self.dense), ("mesh", self.mesh != "none"))
+        return tuple(name for name, chosen in wanted if chosen)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,6 +254,7 @@ class RunConfig:
     alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
     loop_closing: LoopConfig = field(default_factory=LoopConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
+    refinement: RefinementConfig = field(default_factory=RefinementConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     workers: int = 0
     """Processes; 0 takes one per core that this process may use."""

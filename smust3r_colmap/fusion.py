@@ -11,7 +11,7 @@ The next modules to read are the exporters.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -356,6 +356,7 @@ def fuse_points(
     *,
     max_points: int,
     min_confidence: float,
+    depth_scale: FloatArray | None = None,
 ) -> FusedPoints:
     """The confident pixels of all maps as one cloud, averaged over the cells of a regular grid.
 
@@ -377,6 +378,8 @@ def fuse_points(
         cameras: ``fuse_cameras`` of the same pieces.
         max_points: upper bound of the cloud, at least 1.
         min_confidence: pixels below are left out.
+        depth_scale: (N,) what each image's map is multiplied with, where the cameras were adjusted since; 1 if
+            not given.
 
     Raises:
         ValueError: numbers of pieces and maps differ, or ``max_points`` is below 1.
@@ -388,7 +391,13 @@ def fuse_points(
     quota = -(-SAMPLES_PER_POINT * max_points // len(cameras.images))
     origin = np.median(invert_rigid(cameras.cam_from_world)[:, :, 3], axis=0)
     samples, spacing, num_pixels = _gathered(
-        pieces, dense, cameras, origin=origin, quota=quota, min_confidence=min_confidence
+        pieces,
+        dense,
+        cameras,
+        np.ones(len(cameras.images)) if depth_scale is None else depth_scale,
+        origin=origin,
+        quota=quota,
+        min_confidence=min_confidence,
     )
     if not len(samples):
         return FusedPoints(
@@ -438,13 +447,32 @@ def _unit(vectors: FloatArray) -> FloatArray:
     return unit
 
 
-def _surface(placed: PlacedPiece, maps: DenseMaps, k: int, min_confidence: float) -> _Surface:
-    """Image ``k`` of a piece, moved from the segment through the world into its camera there."""
+def depth_in_cameras(
+    pieces: Sequence[PlacedPiece], dense: Sequence[DenseMaps], cameras: FusedCameras
+) -> Iterator[tuple[int, npt.NDArray[np.float32], npt.NDArray[np.float32]]]:
+    """Per image its index, its depth (H, W) in world units, 0 where there is none, and its confidence (H, W).
+
+    Each image gives its map once, from ``cameras.best_piece``; arguments as for ``fuse_points``.
+    """
+    for image, best in zip(cameras.images, cameras.best_piece, strict=True):
+        k = pieces[best].piece.images.index(image)
+        depth = _points_in_camera(pieces[best], dense[best], k)[..., 2]
+        yield image, np.where(np.nan_to_num(depth) > 0, depth, 0).astype(np.float32), dense[best].confidence(k)
+
+
+def _points_in_camera(placed: PlacedPiece, maps: DenseMaps, k: int) -> FloatArray:
+    """(H, W, 3) of image ``k`` of a piece, moved from the segment through the world into its camera there."""
     pointmap_seg = maps.pointmap_seg(k)
     cam_from_world = invert_rigid(placed.world_from_cam[k])
     with np.errstate(invalid="ignore", divide="ignore"):  # a projective transform has a plane at infinity
         points_world = placed.world_from_seg.apply(pointmap_seg.reshape(-1, 3))
-        points_cam = (points_world @ cam_from_world[:, :3].T + cam_from_world[:, 3]).reshape(pointmap_seg.shape)
+        points_cam: FloatArray = points_world @ cam_from_world[:, :3].T + cam_from_world[:, 3]
+    return points_cam.reshape(pointmap_seg.shape)
+
+
+def _surface(placed: PlacedPiece, maps: DenseMaps, k: int, depth_scale: float, min_confidence: float) -> _Surface:
+    """Image ``k`` of a piece in its camera."""
+    points_cam = _points_in_camera(placed, maps, k) * depth_scale
     confident = np.isfinite(points_cam).all(axis=-1) & (maps.confidence(k) >= min_confidence)
     confident &= np.nan_to_num(points_cam[..., 2]) > 0
     to_neighbour = np.linalg.norm(np.diff(points_cam, axis=1), axis=-1)[confident[:, 1:]]
@@ -461,6 +489,7 @@ def _gathered(
     pieces: Sequence[PlacedPiece],
     dense: Sequence[DenseMaps],
     cameras: FusedCameras,
+    depth_scale: FloatArray,
     *,
     origin: FloatArray,
     quota: int,
@@ -469,8 +498,10 @@ def _gathered(
     """Samples of all images, the usual distance of neighbouring pixels, and the number of pixels."""
     parts, spacings, num_pixels = [], [], 0
     world_from_cam = invert_rigid(cameras.cam_from_world)
-    for image, best, pose in zip(cameras.images, cameras.best_piece, world_from_cam, strict=True):
-        surface = _surface(pieces[best], dense[best], pieces[best].piece.images.index(image), min_confidence)
+    each = zip(cameras.images, cameras.best_piece, depth_scale, world_from_cam, strict=True)
+    for image, best, scale, pose in each:
+        k = pieces[best].piece.images.index(image)
+        surface = _surface(pieces[best], dense[best], k, float(scale), min_confidence)
         parts.append(surface.sampled(quota, image, pose, origin))
         spacings += [surface.spacing] if np.isfinite(surface.spacing) else []
         num_pixels += len(surface.points_cam)

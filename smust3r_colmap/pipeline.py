@@ -6,8 +6,10 @@
     reconstruct   every segment alone (III-A)                backbones
     align         segments that share images (III-C, III-E)  alignment.edges, confidence
     stitch        loops proven, all frames optimised (III-F) stitching, pose_graph
-    fuse          every image once, one cloud                fusion
-    export        COLMAP, PLY, GLB, TUM                      exporters
+    place         every image once, its depth map            fusion
+    refine        real tracks, bundle adjustment             refinement
+    fuse          one cloud on the adjusted cameras          fusion
+    export        COLMAP, database, trainer, dense, ...      exports
 
 Every section that takes long leaves a finished stage in the run directory, so that a second start goes on.
 """
@@ -15,7 +17,11 @@ Every section that takes long leaves a finished stage in the run directory, so t
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
+import pycolmap
 
 from smust3r_colmap import fusion
 from smust3r_colmap.alignment.edges import Edges, align_pieces, candidate_pairs, needs_maps
@@ -24,13 +30,17 @@ from smust3r_colmap.backbones.registry import make_backbone, read_options
 from smust3r_colmap.chaining import ChainedPart
 from smust3r_colmap.config import RunConfig
 from smust3r_colmap.config_file import config_to_toml
-from smust3r_colmap.errors import ConfigError, DegenerateAlignmentError, ReconstructionError
+from smust3r_colmap.errors import (
+    ConfigError,
+    DegenerateAlignmentError,
+    ReconstructionError,
+)
 from smust3r_colmap.execution import usable_cores
 from smust3r_colmap.exporters.aside import replace_file
-from smust3r_colmap.exporters.colmap_sparse import MODEL_FILES, refuse_names_text_cannot_hold, write_colmap_sparse
-from smust3r_colmap.exporters.glb import write_glb
-from smust3r_colmap.exporters.ply import write_ply
+from smust3r_colmap.exporters.colmap_sparse import MODEL_FILES, refuse_names_text_cannot_hold
 from smust3r_colmap.exporters.tum_trajectory import write_tum
+from smust3r_colmap.exports import FORMATS, FormatSettings, Outputs, write_where_possible
+from smust3r_colmap.finished_run import FinishedRun, forget_finished, write_finished
 from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.importers.image_folder import (
@@ -40,8 +50,12 @@ from smust3r_colmap.importers.image_folder import (
     scan_image_folder,
 )
 from smust3r_colmap.loops.planning import LoopPlan, plan_loops
+from smust3r_colmap.model_depth import depth_scales
 from smust3r_colmap.products import (
     EMPTY_CLOUD,
+    DenseMaps,
+    DepthMaps,
+    FloatArray,
     ImageCollection,
     PointCloud,
     Scene,
@@ -50,12 +64,14 @@ from smust3r_colmap.products import (
     largest_first,
 )
 from smust3r_colmap.progress import Reporter
+from smust3r_colmap.refinement.refine import Refinement, refine
 from smust3r_colmap.resection import PlacedPiece, place_piece
 from smust3r_colmap.run_directory import RunDirectory, key_of, read_json, write_json
 from smust3r_colmap.segmentation.windows import plan_windows
 from smust3r_colmap.stage_clock import StageClock, peak_memory_bytes
 from smust3r_colmap.stitching import Stitching, stitch
 from smust3r_colmap.stored_alignment import read_edges, write_edges
+from smust3r_colmap.stored_depth import DepthMapWriter, StoredDepthMaps
 from smust3r_colmap.stored_scene import read_scenes, write_scenes
 from smust3r_colmap.summary import (
     EdgeSummary,
@@ -63,6 +79,8 @@ from smust3r_colmap.summary import (
     ImageRemark,
     LoopSummary,
     ModelSummary,
+    RefinementStep,
+    RefinementSummary,
     RunSummary,
     SegmentSummary,
 )
@@ -88,6 +106,7 @@ def reconstruct(
     """
     check_output_not_inside(images, output)
     with RunDirectory(output, fresh=fresh) as run:
+        forget_finished(run)
         clock = StageClock(reporter)
         collection = _import(images, config, run, clock)
         windows = plan_windows(
@@ -100,10 +119,14 @@ def reconstruct(
         _refuse_nothing(result, collection)
         edges = _align(result, segments, config, run, clock)
         stitching = _stitch(result, edges, plan, config, run, clock)
-        scenes = _fuse(result, segments, stitching.parts, collection, config, run, clock)
+        stitched = _place(result, segments, stitching.parts, collection, run, clock)
+        refinement = _refine(stitched, result, windows, collection, config, run, clock)
+        scenes = _fuse(refinement, stitched, result, segments, stitching.parts, config, run, clock)
         unclosed = _without_loops(result, segments, stitching, collection, clock)
-        _export(scenes, unclosed, config, run, clock)
-        summary = _summarise(collection, segments, plan, result, edges, stitching, scenes, run, clock)
+        outputs = _export(scenes, stitched, refinement, unclosed, images, config, run, clock)
+        summary = _summarise(
+            collection, segments, plan, result, edges, stitching, scenes, refinement, outputs, run, clock
+        )
         write_json(run.root / "summary.json", summary.to_json_dict())
     return summary
 
@@ -246,42 +269,130 @@ def _stitch(
     return stitching
 
 
-def _fuse(
+@dataclass(frozen=True, kw_only=True)
+class _Stitched:
+    """The scenes as stitching placed them, without points, and the depth of their images."""
+
+    scenes: tuple[Scene, ...]
+    maps: StoredDepthMaps
+
+
+def _place(
     result: BackboneResult,
     segments: tuple[Segment, ...],
     parts: tuple[ChainedPart, ...],
     collection: ImageCollection,
-    config: RunConfig,
     run: RunDirectory,
     clock: StageClock,
-) -> tuple[Scene, ...]:
-    """Every image once, one camera set and one cloud for every connected part, largest first."""
+) -> _Stitched:
+    """Every image once, one camera set and one depth map for every connected part, largest first."""
     inputs = [
         [_scene_input(result.pieces[p], world_from, collection) for p, world_from in _members(part)] for part in parts
     ]
     kinds = [segment.kind for segment in segments]
-    stored = run.stage("scene", key=key_of("scene", inputs, kinds, result.dense_key, config.fusion))
-    with clock.stage("fusion", total=len(parts)) as stage:
+    stored = run.stage("stitched", key=key_of("stitched", inputs, kinds, result.dense_key))
+    with clock.stage("placing", total=len(parts)) as stage:
         if stored.is_done:
             stage.skip(len(parts))
+        else:
+            with stored.write() as folder:
+                scenes = []
+                maps = DepthMapWriter(folder)
+                for part in sorted(parts, key=lambda part: -_num_images(part, result)):
+                    placed = _placed_pieces(part, result, segments)
+                    cameras = fusion.fuse_cameras(placed)
+                    scenes.append(_scene(placed, cameras, EMPTY_CLOUD, result, collection))
+                    for image, depth, confidence in fusion.depth_in_cameras(placed, _dense(part, result), cameras):
+                        maps.write(collection.images[image].name, depth, confidence)
+                    stage.advance()
+                maps.finish()
+                write_scenes(folder, _without_repeats(largest_first(scenes)))
+    return _Stitched(scenes=read_scenes(stored.path), maps=StoredDepthMaps(stored.path))
+
+
+def _refine(
+    stitched: _Stitched,
+    result: BackboneResult,
+    windows: tuple[Segment, ...],
+    collection: ImageCollection,
+    config: RunConfig,
+    run: RunDirectory,
+    clock: StageClock,
+) -> Refinement | None:
+    """Tracks across the whole scene, and cameras adjusted to them; None where that was not wanted."""
+    if not config.refinement.refine:
+        return None
+    return refine(
+        stitched.scenes,
+        collection,
+        stitched.maps,
+        result.features,
+        config,
+        run,
+        clock,
+        parts=[window.images for window in windows],
+        maps_key=result.dense_key,
+    )
+
+
+def _fuse(
+    refinement: Refinement | None,
+    stitched: _Stitched,
+    result: BackboneResult,
+    segments: tuple[Segment, ...],
+    parts: tuple[ChainedPart, ...],
+    config: RunConfig,
+    run: RunDirectory,
+    clock: StageClock,
+) -> tuple[Scene, ...]:
+    """One cloud for every scene, hung on its cameras as they are now."""
+    scenes = stitched.scenes if refinement is None else refinement.scenes
+    inputs = [(scene.image_names, scene.cam_from_world, scene.cameras, scene.segments) for scene in scenes]
+    stored = run.stage("scene", key=key_of("scene", inputs, result.dense_key, config.fusion))
+    part_of = {tuple(result.pieces[p].name for p in part.pieces): part for part in parts}
+    with clock.stage("fusion", total=len(scenes)) as stage:
+        if stored.is_done:
+            stage.skip(len(scenes))
             return read_scenes(stored.path)
-        scenes = []
-        for part in parts:
+        fused = []
+        for number, scene in enumerate(scenes):
+            part = part_of[scene.segments]
             placed = _placed_pieces(part, result, segments)
-            cameras = fusion.fuse_cameras(placed)
+            cameras, scale = _cameras_of(scene, fusion.fuse_cameras(placed), number, refinement, stitched.maps)
             cloud = fusion.fuse_points(
                 placed,
-                [result.dense[p] for p in part.pieces],
+                _dense(part, result),
                 cameras,
                 max_points=config.fusion.max_points,
                 min_confidence=config.fusion.min_confidence,
+                depth_scale=scale,
             ).cloud
-            scenes.append(_scene(placed, cameras, cloud, result, collection))
+            fused.append(replace(scene, points=cloud))
             stage.advance()
-        kept = _without_repeats(largest_first(scenes))
         with stored.write() as folder:
-            write_scenes(folder, kept)
-    return kept
+            write_scenes(folder, tuple(fused))
+    return tuple(fused)
+
+
+def _cameras_of(
+    scene: Scene, fused: fusion.FusedCameras, number: int, refinement: Refinement | None, maps: DepthMaps
+) -> tuple[fusion.FusedCameras, FloatArray | None]:
+    """The fused cameras with the poses of the scene, and what each depth map is to be multiplied with."""
+    model = None if refinement is None else refinement.models[number]
+    if model is None:
+        return fused, None
+    position = {image: k for k, image in enumerate(scene.image_indices)}
+    poses = scene.cam_from_world[[position[image] for image in fused.images]]
+    scales = depth_scales(pycolmap.Reconstruction(model), maps)
+    return replace(fused, cam_from_world=poses), np.array([scales[image + 1] for image in fused.images])
+
+
+def _dense(part: ChainedPart, result: BackboneResult) -> list[DenseMaps]:
+    return [result.dense[p] for p in part.pieces]
+
+
+def _num_images(part: ChainedPart, result: BackboneResult) -> int:
+    return len({image for p in part.pieces for image in result.pieces[p].images})
 
 
 def _placed_pieces(part: ChainedPart, result: BackboneResult, segments: tuple[Segment, ...]) -> tuple[PlacedPiece, ...]:
@@ -358,23 +469,37 @@ def _without_loops(
 
 def _export(
     scenes: tuple[Scene, ...],
+    stitched: _Stitched,
+    refinement: Refinement | None,
     unclosed: Scene | None,
+    images: Path,
     config: RunConfig,
     run: RunDirectory,
     clock: StageClock,
-) -> None:
-    """Every model for COLMAP; cloud, viewer file and trajectory of the largest, and how it was without loops."""
-    with clock.stage("export", total=len(scenes)) as stage:
-        run.clear_results(MODEL_FILES)
-        for number, scene in enumerate(scenes):
-            write_colmap_sparse(scene, run.sparse_model(number), text=config.output.text)
-            stage.advance()
-        write_ply(scenes[0].points, run.root / "points.ply")
-        write_glb(scenes[0], run.root / "scene.glb")
-        write_tum(scenes[0], run.root / "trajectory_tum.txt", None)
+) -> Outputs:
+    """Every model for COLMAP; the other formats of the largest, and how its trajectory was before; what failed."""
+    run.clear_results(MODEL_FILES)
+    finished = FinishedRun(
+        output=run.root,
+        native_log=run.native_log,
+        images=images,
+        scenes=scenes,
+        models=(None,) * len(scenes) if refinement is None else refinement.models,
+        database=None if refinement is None or not any(refinement.models) else refinement.database,
+        maps=stitched.maps,
+    )
+    with clock.stage("export", total=1) as stage:
+        settings = FormatSettings.of(config.output)
+        for name in ("sparse", "ply", "glb", "tum", *(("database",) if finished.database else ())):
+            FORMATS[name].write(finished, settings)
+        write_tum(stitched.scenes[0], run.root / "trajectory_stitched_tum.txt", None)
         if unclosed is not None:
             write_tum(unclosed, run.root / "trajectory_without_loops_tum.txt", None)
         replace_file(run.root / "config.toml", config_to_toml(config).encode())
+        write_finished(run, finished)
+        stage.advance()
+    large = config.output.large_formats if finished.database else ()
+    return write_where_possible(finished, large, settings, clock)
 
 
 def _summarise(
@@ -385,6 +510,8 @@ def _summarise(
     edges: Edges,
     stitching: Stitching,
     scenes: tuple[Scene, ...],
+    refinement: Refinement | None,
+    outputs: Outputs,
     run: RunDirectory,
     clock: StageClock,
 ) -> RunSummary:
@@ -442,6 +569,48 @@ def _summarise(
             improved=stitching.solution.improved,
         ),
         peak_memory_bytes=peak_memory_bytes(),
+        refinements=() if refinement is None else refinement_summaries(refinement, collection, run),
+        missing_outputs=outputs.missing,
+        remarks=outputs.remarks,
+    )
+
+
+def refinement_summaries(
+    refinement: Refinement, collection: ImageCollection, run: RunDirectory
+) -> tuple[RefinementSummary, ...]:
+    """One per scene; also for a model from elsewhere."""
+    return tuple(
+        RefinementSummary(
+            folder=run.sparse_model(number).relative_to(run.root).as_posix(),
+            kept=one.kept,
+            reason=one.reason,
+            num_points=one.final.num_points,
+            num_observations=one.final.num_observations,
+            mean_track_length=one.final.mean_track_length,
+            reprojection_error_px=one.final.reprojection_error_px,
+            num_pairs=one.num_pairs,
+            num_matches=one.num_matches,
+            num_refused_pairs=one.num_refused_pairs,
+            weak=tuple(collection.images[i].name for i in one.weak),
+            registered=tuple(collection.images[i].name for i in one.registered),
+            steps=tuple(
+                RefinementStep(
+                    name=step.name,
+                    observations_before=step.before.num_observations,
+                    observations_after=step.after.num_observations,
+                    error_before_px=step.before.reprojection_error_px,
+                    error_after_px=step.after.reprojection_error_px,
+                    track_length_after=step.after.mean_track_length,
+                    images_after=step.after.num_images,
+                    moved_percent=step.moved_percent,
+                    turned_deg=step.turned_deg,
+                    kept=step.kept,
+                    reason=step.reason,
+                )
+                for step in one.steps
+            ),
+        )
+        for number, one in enumerate(refinement.figures)
     )
 
 

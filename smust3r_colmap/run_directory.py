@@ -66,6 +66,10 @@ class RunDirectory:
         "scene.glb",
         "trajectory_tum.txt",
         "trajectory_without_loops_tum.txt",
+        "trajectory_stitched_tum.txt",
+        "database.db",
+        "trainer",
+        "dense",
         "summary.json",
         "config.toml",
     )

@@ -164,6 +164,71 @@ class GraphSummary:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RefinementStep:
+    """What one step of the refinement did to a model.
+
+    Args:
+        name: of the step.
+        observations_before, observations_after: of tracks of two images or more.
+        error_before_px, error_after_px: mean reprojection error of the points.
+        track_length_after: observations per point.
+        images_after: registered.
+        moved_percent, turned_deg: median of the cameras, in percent of the path's extent and in degrees.
+        kept: the step stands. reason: why it was undone, or empty.
+    """
+
+    name: str
+    observations_before: int
+    observations_after: int
+    error_before_px: float
+    error_after_px: float
+    track_length_after: float
+    images_after: int
+    moved_percent: float
+    turned_deg: float
+    kept: bool
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefinementSummary:
+    """Tracks and bundle adjustment of one model.
+
+    Args:
+        folder: of the model, as in ``ModelSummary``.
+        kept: the model has tracks and adjusted cameras. reason: why not, or empty.
+        num_points, num_observations, mean_track_length, reprojection_error_px: of the model with tracks.
+        num_pairs, num_matches: image pairs with tracks, and their matches.
+        num_refused_pairs: verified pairs that contradict the stitched geometry, such as look-alike places.
+        weak: images with fewer than 15 observations, which keep their stitched place.
+        registered: images that had no pose before.
+        steps: in order.
+    """
+
+    folder: str
+    kept: bool
+    reason: str
+    num_points: int
+    num_observations: int
+    mean_track_length: float
+    reprojection_error_px: float
+    num_pairs: int
+    num_matches: int
+    num_refused_pairs: int
+    weak: tuple[str, ...]
+    registered: tuple[str, ...]
+    steps: tuple[RefinementStep, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MissingOutput:
+    """A part of the result that could not be written, and why."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class RunSummary:
     """The whole run.
 
@@ -180,6 +245,9 @@ class RunSummary:
         loops: that were planned. loops_note: why none could be looked for, or empty.
         graph: the optimisation of the frames of all pieces.
         peak_memory_bytes: largest resident size of this process or of one of its children.
+        refinements: one per model; empty where none was wanted.
+        missing_outputs: parts of the result that could not be written.
+        remarks: what was left out of those that were written.
 
     Raises:
         ValueError: the counts contradict each other, or there is no model.
@@ -198,6 +266,9 @@ class RunSummary:
     loops_note: str
     graph: GraphSummary
     peak_memory_bytes: int
+    refinements: tuple[RefinementSummary, ...] = ()
+    missing_outputs: tuple[MissingOutput, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.models:
@@ -241,6 +312,12 @@ class RunSummary:
                 f"the geometry of {len(doubted)} of {len(self.segments)} segments should not be trusted, such as "
                 f"segment {doubted[0].index}: {doubted[0].doubts[0]}"
             )
+        if self.refinements and not self.refinements[0].kept:
+            reasons.append(f"the largest model has no tracks: {self.refinements[0].reason}")
+        num_weak = sum(len(one.weak) for one in self.refinements if one.kept)
+        if num_weak:
+            reasons.append(f"{num_weak} images rest on fewer than 15 observations; they keep their stitched place")
+        reasons += [f"no {one.name}: {one.reason}" for one in self.missing_outputs]
         return tuple(reasons)
 
     @property
@@ -266,8 +343,10 @@ class RunSummary:
         lines = [f"{self.num_registered} of {self.num_images} images have a pose. Scale: {self.scale_statement}."]
         lines += [f"  {_model_line(model)}" for model in self.models]
         lines += _loop_lines(self.loops, self.loops_note)
+        lines += [line for one in self.refinements for line in _refinement_lines(one)]
         lines += _remark_lines("without a pose", self.unregistered)
         lines += _remark_lines("left out", self.rejected)
+        lines += [f"  {remark}" for remark in self.remarks]
         lines += [f"weak: {reason}" for reason in self.weak_reasons]
         lines.append(self._cost_line())
         lines.append(f"Result in {self.output}")
@@ -285,6 +364,21 @@ class RunSummary:
 def _model_line(model: ModelSummary) -> str:
     segments = f"segments {', '.join(model.segments)}" if len(model.segments) > 1 else "one segment"
     return f"{model.folder}: {model.num_images} images, {model.num_points} points, {segments}"
+
+
+def _refinement_lines(one: RefinementSummary) -> list[str]:
+    if not one.kept:
+        return [f"  {one.folder}: no tracks ({one.reason})"]
+    lines = [
+        f"  {one.folder}: {one.num_observations} observations of {one.num_points} points "
+        f"(track length {one.mean_track_length:.2f}), reprojection error {one.reprojection_error_px:.2f} px"
+    ]
+    lines += [f"  {one.folder}: {step.name} undone, {step.reason}" for step in one.steps if not step.kept]
+    for what, names in (("few observations", one.weak), ("placed by the refinement", one.registered)):
+        if names:
+            more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
+            lines.append(f"  {one.folder}: {what}: {', '.join(names[:_NAMES_SHOWN])}{more}")
+    return lines
 
 
 def _loop_lines(loops: tuple[LoopSummary, ...], note: str) -> list[str]:

