@@ -259,7 +259,8 @@ class RunConfig:
     workers: int = 0
     """Processes; 0 takes one per core that this process may use."""
     seed: int = 0
-    """Of every random choice; the same seed on the same machine gives the same result."""
+    """Of every random choice; the same seed on the same machine gives the same result, to the last bit with one
+    worker."""
 
     def __post_init__(self) -> None:
         if self.workers < 0:

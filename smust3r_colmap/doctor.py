@@ -36,7 +36,7 @@ _PACKAGES = (
     ("open3d", "import open3d\nif open3d.core.cuda.is_available(): print('CUDA')"),
 )
 
-# They may be broken and a reconstruction still works: nothing loads open3d, and torch is for networks only.
+# They may be broken and a reconstruction still works: open3d is for meshes only, torch for networks.
 _NOT_NEEDED = frozenset({"open3d", "torch"})
 
 _PARTS = (

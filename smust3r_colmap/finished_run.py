@@ -1,7 +1,7 @@
 """A finished run, opened again to write its results in other formats; nothing is computed anew.
 
-What a run stitched, refined and fused lies in its ``work`` folder; ``work/finished.json``, which a run writes last,
-says which of it belongs together. The next module to read is ``exports``.
+What a run stitched, refined and fused lies in its ``work`` folder; ``work/finished.json``, written when all stages
+stand, says which of it belongs together. The next module to read is ``exports``.
 """
 
 from __future__ import annotations

@@ -2,7 +2,11 @@
 
     OUT/
       sparse/0/ 1/ ...     COLMAP models, largest first
-      points.ply  scene.glb  trajectory_tum.txt  trajectory_without_loops_tum.txt
+      database.db          keypoints, matches and priors, with the ids of the models
+      points.ply  scene.glb
+      trainer/             for splat and NeRF trainers
+      dense/               COLMAP's workspace of depth and normal maps, fused.ply
+      trajectory_tum.txt  trajectory_stitched_tum.txt  trajectory_without_loops_tum.txt
       summary.json  config.toml
       work/
         lock               held by the process that writes
@@ -14,7 +18,11 @@
         tokens/            images as the MUSt3R network encoded them; the least recently used give way
         segments/0000/     mapping/  calibrated/  depth_0/  depth_1/ ..., or the prediction of a network
         alignment/         edges between the pieces
-        scene/             the fused models, before they are exported
+        stitched/          cameras as stitching placed them, one depth map per image
+        track_pairs/       image pairs that the stitched geometry suggests for tracks
+        refined/           0/model  1/model ...  database.db  figures.json
+        scene/             the adjusted cameras and fused clouds, before they are exported
+        finished.json      when all stages stand: which of them belong together, and where the images are
 
 A stage is a folder. It is written aside (``NAME.partial``) and renamed, with a ``stage.json`` that
 holds the key: a hash of its inputs and settings. A folder whose key is as expected is finished and

@@ -7,7 +7,7 @@ that image contradicts is dropped.
 
 A track is one corner. Where it was detected it has no error, everywhere else it is what was laid on it, and
 what was found once is carried on to the next images rather than detected again: that makes tracks long.
-Coordinates are pixels of the grey image until they are returned. The next module to read is ``triangulation``.
+Coordinates are pixels of the grey image until they are returned. The next module to read is ``adjustment``.
 """
 
 from __future__ import annotations

@@ -3,13 +3,15 @@
 COLMAP keeps the principal point in the middle of the image, because a few images do not determine it. Many
 images from many sides do, and then a wrong one bends the whole model: freeing it took the cameras of a
 courtyard from 0.19 m to 0.03 m. So two halves of the points are asked separately, each with cameras of its
-own, and the answer counts where they agree. The next module to read is ``task``.
+own, and the answer counts where they agree. The priors of the centres, which both share, are loosened before:
+cameras that never turn, such as of a drone that flies sideways, leave a shear of the whole world open, priors
+would close it by their own errors, and both halves would agree on them. The next module to read is ``task``.
 """
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
@@ -27,6 +29,8 @@ MAX_SHIFT = 0.025
 """As a part of the longer image side; real cameras stay within a percent or two."""
 AGREEMENT = 0.2
 """Part of the shift by which the two halves may differ."""
+LOOSE = 100.0
+"""Times the standard deviation of the priors: they hold frame and scale, and say nothing of a principal point."""
 MAX_ITERATIONS = 30
 
 
@@ -44,19 +48,26 @@ class PrincipalPointAnswer:
 
 
 def ask_for_principal_points(model: pycolmap.Reconstruction, priors: Priors, *, threads: int) -> PrincipalPointAnswer:
-    """Let two halves of the points of ``model``, which stays as it is, say where the principal points are."""
-    counts = dict.fromkeys(model.cameras, 0)
+    """Let two halves of the points of ``model``, which stays as it is, say where the principal points are.
+
+    Args:
+        model: adjusted, with tracks.
+        priors: where the cameras were; only frame and scale are taken from them.
+        threads: of Ceres; with one the answer is the same in every run.
+    """
+    counts = dict.fromkeys(sorted(model.cameras), 0)
     for image_id in model.reg_image_ids():
         counts[model.image(image_id).camera_id] += 1
     used = [camera_id for camera_id, count in counts.items() if count]
     poor = [camera_id for camera_id in used if counts[camera_id] < MIN_IMAGES]
     if poor:
         return PrincipalPointAnswer(xy_img={}, reason=f"camera {poor[0]} has {counts[poor[0]]} of {MIN_IMAGES} images")
+    loose = replace(priors, sigma=LOOSE * priors.sigma)
     halves = []
     for half in (0, 1):
         part = _part_of(model, half)
         if not adjust(
-            part, priors, calibrated=False, principal_point=True, max_iterations=MAX_ITERATIONS, threads=threads
+            part, loose, calibrated=False, principal_point=True, max_iterations=MAX_ITERATIONS, threads=threads
         ):
             return PrincipalPointAnswer(xy_img={}, reason="half of the points gave no solution")
         halves.append({camera_id: _principal_point(part.camera(camera_id)) for camera_id in used})

@@ -232,7 +232,9 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
     bench.filter(MAX_ERROR_PX)
     free = not task.calibrated and _is_principal_point_determined(bench.model, priors, task)
     if free:
-        steps.append(_adjustment("principal point", bench.model, priors, task, SECOND_ITERATIONS, principal_point=True))
+        moved = _adjustment("principal point", bench.model, priors, task, SECOND_ITERATIONS, principal_point=True)
+        steps.append(moved)
+        free = moved.kept
         bench.filter(MAX_ERROR_PX)
     for _ in range(MAX_LAST_ROUNDS):
         bench.complete(tight)

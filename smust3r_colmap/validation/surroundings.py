@@ -65,7 +65,8 @@ def _image_file(path: Path, name: str) -> ImageFile:
 def read_database(path: Path) -> Database:
     """Ids, names and numbers of keypoints; ``problem`` says why where this is no COLMAP database."""
     try:
-        connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
+        # Merely read-only, SQLite would still leave its two helper files beside a database in WAL mode.
+        connection = sqlite3.connect(f"{path.absolute().as_uri()}?immutable=1", uri=True)
         try:
             return _database(path, connection)
         finally:
