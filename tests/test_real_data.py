@@ -47,14 +47,14 @@ def fountain(
     return run(folder, names, tmp_path_factory.mktemp("fountain"))
 
 
-def test_fountain_in_two_segments_is_within_three_centimetres(fountain: tuple[RunSummary, Evaluation]) -> None:
-    """15 m across; pycolmap's incremental mapper, which is not given the calibration either, has 1.2 cm."""
+def test_fountain_in_two_segments_is_within_a_centimetre(fountain: tuple[RunSummary, Evaluation]) -> None:
+    """15 m across; pycolmap's mappers, which are not given the calibration either, have 8 to 11 mm."""
     summary, found = fountain
     assert summary.exit_code == 0
     assert len(summary.segments) == 2
     assert summary.num_registered == found.num_compared == 11
-    assert 0 < found.position_rmse < 0.03
-    assert found.rotation_median_deg < 0.8
+    assert 0 < found.position_rmse < 0.01
+    assert found.rotation_median_deg < 0.6
 
 
 def test_fountain_reads_back_with_its_true_size_and_focal_length(fountain: tuple[RunSummary, Evaluation]) -> None:
@@ -64,7 +64,10 @@ def test_fountain_reads_back_with_its_true_size_and_focal_length(fountain: tuple
     assert (camera.width, camera.height) == (1024, 683)
     assert camera.params[0] == pytest.approx(920.7, rel=0.01)  # the set's own calibration
     ours = pycolmap.Reconstruction(summary.output / "sparse/0")
-    assert ours.num_points3D() == summary.models[0].num_points > 50_000
+    assert ours.num_points3D() == summary.refinements[0].num_points > 2_000
+    assert min(point.track.length() for point in ours.points3D.values()) >= 2
+    assert ours.compute_mean_track_length() > 4
+    assert summary.models[0].num_points > 50_000
 
 
 def test_fountain_has_no_double_walls(fountain: tuple[RunSummary, Evaluation]) -> None:
@@ -120,4 +123,5 @@ def test_the_loop_round_a_courtyard_is_found_and_closed(data_dir: Callable[[str]
     assert np.linalg.norm(ends[0][:, 3] - ends[1][:, 3]) < 0.1 * found.extent
     assert np.degrees(np.arccos(ends[0][:, 2] @ ends[1][:, 2])) < 40
     assert summary.num_registered == found.num_compared == 30
-    assert found.position_rmse_percent < 2.0
+    assert found.position_rmse_percent < 0.3
+    assert summary.refinements[0].num_refused_pairs > 10  # look-alike windows of the facades
