@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from smust3r_colmap.backbones.feed_forward import FeedForwardBackbone
 from smust3r_colmap.backbones.registry import make_backbone
 from smust3r_colmap.backbones.vggt import Crop, VggtPredictor
-from smust3r_colmap.config import LoopConfig, OutputConfig, RunConfig, SegmentationConfig
+from smust3r_colmap.config import LoopConfig, OutputConfig, RefinementConfig, RunConfig, SegmentationConfig
 from smust3r_colmap.errors import CheckpointError, ConfigError, MissingDependencyError, ReconstructionError
 from smust3r_colmap.evaluation import compare_trajectories, read_reference_sparse
 from smust3r_colmap.geometry.camera import Intrinsics
@@ -297,6 +297,7 @@ def test_a_whole_run_gives_the_true_trajectory(room: Room, checkpoint: Path, tmp
         backbone_options=f"checkpoint={checkpoint},size={SIZE}",
         segmentation=SegmentationConfig(segment_length=6, overlap=3),
         loop_closing=LoopConfig(loops=False),
+        refinement=RefinementConfig(refine=False),  # the photographs of this room have nothing for SIFT
         output=OutputConfig(trainer=False, dense=False),
     )
     summary = reconstruct(tmp_path / "images", tmp_path / "out", config, reporter=QuietReporter(sys.stderr))
