@@ -44,10 +44,8 @@ from smust3r_colmap.finished_run import FinishedRun, forget_finished, write_fini
 from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.importers.image_folder import (
-    ImportRecord,
     check_output_not_inside,
     collection_from_scan,
-    scan_image_folder,
 )
 from smust3r_colmap.loops.planning import LoopPlan, plan_loops
 from smust3r_colmap.model_depth import depth_scales
@@ -72,6 +70,7 @@ from smust3r_colmap.stage_clock import StageClock, peak_memory_bytes
 from smust3r_colmap.stitching import Stitching, stitch
 from smust3r_colmap.stored_alignment import read_edges, write_edges
 from smust3r_colmap.stored_depth import DepthMapWriter, StoredDepthMaps
+from smust3r_colmap.stored_scan import scan_changed_files
 from smust3r_colmap.stored_scene import read_scenes, write_scenes
 from smust3r_colmap.summary import (
     EdgeSummary,
@@ -133,15 +132,8 @@ def reconstruct(
 
 def _import(images: Path, config: RunConfig, run: RunDirectory, clock: StageClock) -> ImageCollection:
     """Read the folder; files that did not change since an earlier start are not decoded again."""
-    stored = run.stage("import", key=key_of("import"))
     with clock.stage("import", total=1) as stage:
-        known = {}
-        if stored.is_done:
-            records = (ImportRecord.from_json(facts) for facts in read_json(stored.path / "records.json"))
-            known = {record.name: record for record in records}
-        scan = scan_image_folder(images, known=known, workers=config.workers)
-        with stored.write() as folder:
-            write_json(folder / "records.json", [record.to_json() for record in scan.records])
+        scan = scan_changed_files(images, run, workers=config.workers)
         collection = collection_from_scan(scan, config.importing)
         if config.output.text:
             refuse_names_text_cannot_hold(image.name for image in collection.images)

@@ -32,15 +32,16 @@ from smust3r_colmap.finished_run import FinishedRun, forget_finished, write_fini
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.importers.colmap_model import ForeignModel, read_colmap_model
 from smust3r_colmap.importers.fitted_model import FittedModel, fit_to_images
-from smust3r_colmap.importers.image_folder import ImportRecord, check_output_not_inside, scan_image_folder
+from smust3r_colmap.importers.image_folder import check_output_not_inside
 from smust3r_colmap.pipeline import refinement_summaries
 from smust3r_colmap.products import FloatArray, PointCloud, RunFeatures, Scene
 from smust3r_colmap.progress import Reporter
 from smust3r_colmap.refinement.correspondences import Pair
 from smust3r_colmap.refinement.refine import Refinement, refine, surfaces_of_clouds
-from smust3r_colmap.run_directory import RunDirectory, key_of, read_json, write_json
+from smust3r_colmap.run_directory import RunDirectory, key_of, write_json
 from smust3r_colmap.segmentation.windows import plan_windows
 from smust3r_colmap.stage_clock import StageClock, peak_memory_bytes
+from smust3r_colmap.stored_scan import scan_changed_files
 from smust3r_colmap.stored_scene import write_scenes
 from smust3r_colmap.summary import GraphSummary, ImageRemark, ModelSummary, RunSummary
 
@@ -113,15 +114,8 @@ def _fit(
     foreign: ForeignModel, images: Path, config: RunConfig, cameras: CameraChoice, run: RunDirectory, clock: StageClock
 ) -> FittedModel:
     """Files that did not change since an earlier start are not decoded again."""
-    stored = run.stage("import", key=key_of("import"))
     with clock.stage("import", total=1) as stage:
-        known = {}
-        if stored.is_done:
-            records = (ImportRecord.from_json(facts) for facts in read_json(stored.path / "records.json"))
-            known = {record.name: record for record in records}
-        scan = scan_image_folder(images, known=known, workers=config.workers)
-        with stored.write() as folder:
-            write_json(folder / "records.json", [record.to_json() for record in scan.records])
+        scan = scan_changed_files(images, run, workers=config.workers)
         fitted = fit_to_images(
             foreign, scan, share_cameras=cameras.share, camera_model=cameras.model, calibrated=cameras.calibrated
         )
