@@ -55,10 +55,10 @@ def write_colmap_sparse(scene: Scene, folder: Path, *, text: bool = False) -> No
         refuse_names_text_cannot_hold(scene.image_names)
     model = _reconstruction(scene)
     with replaced_folder(folder, may_hold=MODEL_FILES) as partial:
-        model.write_binary(partial)
+        write_binary_checked(model, partial, to_be=folder)
         if text:
             model.write_text(partial)
-        _refuse_truncated(scene, partial, folder)
+            _refuse_truncated_text(scene, partial, folder)
 
 
 def _reconstruction(scene: Scene) -> pycolmap.Reconstruction:
@@ -77,27 +77,40 @@ def _reconstruction(scene: Scene) -> pycolmap.Reconstruction:
     return model
 
 
-def _refuse_truncated(scene: Scene, partial: Path, folder: Path) -> None:
-    """pycolmap stays silent when the disk is full, so count what arrived.
+def write_binary_checked(model: pycolmap.Reconstruction, folder: Path, *, to_be: Path | None = None) -> None:
+    """Write the ``.bin`` files into a folder that exists, and count what arrived: pycolmap is silent on a full disk.
 
-    The sizes follow from the three files' public layout: a count of 8 bytes each, then per camera id,
-    model, size and parameters; per image id, pose, camera, name with its zero, and the count of its
-    observations; per point id, position, colour, error and the length of its track.
+    Args:
+        model: any model.
+        folder: where the files are written. to_be: where they will stand, for the message.
+
+    Raises:
+        StorageError: less arrived than was written.
+
+    Source: the sizes follow from COLMAP's documented layout: a count of 8 bytes each, then per camera id, model, size
+    and parameters; per image id, pose, camera, name with its zero, the count of its observations and 24 bytes for
+    each; per point id, position, colour, error, the length of its track and 8 bytes for each element.
     """
-    cameras = [scene.cameras[camera] for camera in set(scene.camera_indices)]
+    model.write_binary(folder)
+    registered = [model.image(image_id) for image_id in model.reg_image_ids()]
     expected = {
-        "cameras.bin": 8 + sum(24 + 8 * len(camera.params) for camera in cameras),
-        "images.bin": 8 + sum(64 + len(name.encode()) + 1 + 8 for name in scene.image_names),
-        "points3D.bin": 8 + 51 * len(scene.points),
+        "cameras.bin": 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values()),
+        "images.bin": 8
+        + sum(64 + len(image.name.encode()) + 1 + 8 + 24 * image.num_points2D() for image in registered),
+        "points3D.bin": 8 + 51 * model.num_points3D() + 8 * model.compute_num_observations(),
     }
-    found = {name: (partial / name).stat().st_size for name in expected}
-    if (partial / "points3D.txt").exists():
-        expected |= {"images.txt": 2 * len(scene), "points3D.txt": len(scene.points)}
-        found |= {name: _count_lines(partial / name) for name in ("images.txt", "points3D.txt")}
     for name, count in expected.items():
-        if found[name] != count:
-            unit = "bytes" if name.endswith(".bin") else "lines"
-            raise StorageError(f"{folder / name}: {found[name]} of {count} {unit} arrived; is the disk full?")
+        _refuse_less(to_be or folder, name, (folder / name).stat().st_size, count, "bytes")
+
+
+def _refuse_truncated_text(scene: Scene, partial: Path, folder: Path) -> None:
+    for name, count in {"images.txt": 2 * len(scene), "points3D.txt": len(scene.points)}.items():
+        _refuse_less(folder, name, _count_lines(partial / name), count, "lines")
+
+
+def _refuse_less(folder: Path, name: str, found: int, expected: int, unit: str) -> None:
+    if found != expected:
+        raise StorageError(f"{folder / name}: {found} of {expected} {unit} arrived; is the disk full?")
 
 
 def _count_lines(path: Path) -> int:

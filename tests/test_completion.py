@@ -14,7 +14,7 @@ from smust3r_colmap.config import ImportConfig
 from smust3r_colmap.execution import TaskFailure, TaskResult
 from smust3r_colmap.importers.image_folder import collection_from_scan, scan_image_folder
 from smust3r_colmap.refinement import completion as completion_module
-from smust3r_colmap.refinement import task as task_module
+from smust3r_colmap.refinement.bench import Bench
 from smust3r_colmap.refinement.completion import Completion, _MappingTask, complete_model
 from smust3r_colmap.refinement.steps import StepReport
 from smust3r_colmap.run_directory import RunDirectory
@@ -127,7 +127,7 @@ def test_the_refinement_stores_what_completion_added(
     added: bool, finished_example: Example, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The refinement by itself would have placed the image; it is kept from it here."""
-    monkeypatch.setattr(task_module._Bench, "register_missing", lambda *_: ())
+    monkeypatch.setattr(Bench, "register_missing", lambda *_: ())
     collection = collection_from_scan(scan_image_folder(finished_example.images), ImportConfig())
     placed = [i for i in range(NUM_PLACED) if i != TAKEN_OUT or not added]
     with RunDirectory(tmp_path / "run") as run:

@@ -300,7 +300,7 @@ def test_halves_may_differ_by_a_fifth_of_the_shift(
 def seen() -> tuple[World, FloatArray]:
     """Off centre by 1 % of the width, and as stitched."""
     rng = np.random.default_rng(6)
-    world = make_world(around(12), 2 * ball(120, rng), rng, camera=off_centre(SHIFT), clutter=0)
+    world = make_world(around(12), 2 * ball(200, rng), rng, camera=off_centre(SHIFT), clutter=0)
     return world, disturbed(world.cam_from_world, rng, position=0.005 * world.extent, rotation_deg=0.3)
 
 

@@ -47,6 +47,7 @@ from smust3r_colmap.products import FloatArray, ImageCollection, PointCloud, Run
 from smust3r_colmap.progress import QuietReporter, Stage
 from smust3r_colmap.refinement import adjustment, refine, task
 from smust3r_colmap.refinement.adjustment import ENOUGH_OBSERVATIONS, MANY_OBSERVATIONS, figures_of
+from smust3r_colmap.refinement.bench import Bench
 from smust3r_colmap.refinement.correspondences import Pair
 from smust3r_colmap.refinement.refine import Refinement, surfaces_of_clouds
 from smust3r_colmap.refinement.task import RefinedFigures, RefineTask, refine_scenes
@@ -322,7 +323,7 @@ def test_needless_points_go_and_the_others_stay() -> None:
         elements = [pycolmap.TrackElement(image_id, row) for image_id in images]
         model.add_point3D(np.array([0.0, 0, 1 + row]), pycolmap.Track(elements), np.zeros(3, np.uint8))
     mapper = SimpleNamespace(observation_manager=pycolmap.ObservationManager(model))
-    task._drop_needless_pairs(cast(task._Bench, SimpleNamespace(model=model, mapper=mapper)))
+    Bench.drop_needless_pairs(cast(Bench, SimpleNamespace(model=model, mapper=mapper)))
     tracks = [tuple(e.image_id for e in point.track.elements) for point in model.points3D.values()]
     assert sorted(tracks) == [(1, 2, 3)] * 80 + [(3, 4)] * 7
 

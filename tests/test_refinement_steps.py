@@ -15,6 +15,7 @@ from smust3r_colmap.refinement.adjustment import extent_of, figures_of
 from smust3r_colmap.refinement.steps import (
     FOCAL_RANGE,
     MAX_LOST,
+    MAX_PRINCIPAL_POINT_SHIFT,
     movement,
     num_good_observations,
     take_snapshot,
@@ -76,6 +77,13 @@ def zoom(model: pycolmap.Reconstruction) -> bool:
     return True
 
 
+def look_aside(model: pycolmap.Reconstruction) -> bool:
+    camera = model.camera(1)
+    shift = 1.01 * MAX_PRINCIPAL_POINT_SHIFT * max(camera.width, camera.height)
+    camera.params = [camera.params[0], camera.params[1] + shift, *camera.params[2:]]
+    return True
+
+
 def bend(model: pycolmap.Reconstruction) -> bool:
     camera = model.camera(1)
     camera.params = [*camera.params[:3], -1.2]
@@ -104,6 +112,7 @@ def give_up(model: pycolmap.Reconstruction) -> bool:
         (lose_a_camera, r"only \d+ of \d+ good observations stayed good"),
         (run_away, r"the cameras moved by 25 % of the path's extent in the median"),
         (zoom, r"the focal length of camera 1 went to 2 times what it was"),
+        (look_aside, r"the principal point of camera 1 went \d+ px away"),
         (bend, r"the distortion of camera 1 went beyond 1"),
         (break_a_pose, "the adjustment diverged"),
         (break_a_point, "the adjustment diverged"),

@@ -132,6 +132,25 @@ def ask_consent(features: MatchedFeatures, views: Mapping[int, View], *, toleran
     )
 
 
+def consent_shares(
+    features: MatchedFeatures, views: Mapping[int, View], *, tolerance: float, min_matches: int
+) -> dict[Pair, float]:
+    """Which part of a pair's verified matches lies on the epipolar lines of ``views``.
+
+    Args:
+        features: of the run.
+        views: by image index; pairs of which one is missing are left out.
+        tolerance: as in ``ask_consent``.
+        min_matches: pairs with fewer verified matches are left out.
+    """
+    rays = {i: view.intrinsics.rays_cam(features.keypoints[i])[:, :2] for i, view in views.items()}
+    return {
+        pair: float(_on_epipolar_lines(pair, rows, views, rays, tolerance).mean())
+        for pair, rows in features.verified.items()
+        if len(rows) >= min_matches and pair[0] in views and pair[1] in views
+    }
+
+
 def _on_epipolar_lines(
     pair: Pair,
     matches: npt.NDArray[np.uint32],

@@ -26,13 +26,14 @@ from smust3r_colmap.geometry.camera import Intrinsics, pointmap_from_depth
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import EMPTY_CLOUD, DepthMaps, FloatArray, ImageCollection, RunFeatures, Scene
 from smust3r_colmap.refinement.adjustment import ModelFigures
+from smust3r_colmap.refinement.bench import LOOSE_PART
 from smust3r_colmap.refinement.correspondences import Pair
 from smust3r_colmap.refinement.pair_selection import SeenSurface, sample_rows, select_pairs
 from smust3r_colmap.refinement.steps import StepReport
 from smust3r_colmap.refinement.task import (
     DATABASE_FILE,
-    LOOSE_PART,
     MODEL_FOLDER,
+    STAYED,
     RefinedFigures,
     RefineTask,
     refine_scenes,
@@ -47,7 +48,9 @@ MAX_CLOUD_POINTS = 50_000
 GRID = 12
 """Cells along the longer side of an image in which its surface is sampled."""
 NEXT_IMAGES = 4
-"""Neighbours in order that are always matched by pointmaps."""
+"""Neighbours in order that are matched in any case where no backbone has matched them."""
+METHOD_VERSION = 2
+"""To be raised when the refinement changes, so that finished folders are refined again."""
 MIN_CONFIDENCE = 1.5
 """Of depth that is sampled; 1 is none at all."""
 
@@ -129,7 +132,8 @@ def refine(
     map_pairs = () if source == "features" else _pairs_for_maps(seen, config.refinement.track_neighbours)
     geometry = [(s.image_names, s.image_indices, s.camera_indices, s.cameras, s.cam_from_world) for s in scenes]
     settings = (config.refinement, collection.calibrated, tolerance)
-    stored = run.stage("refined", key=key_of("refined", features and features.key, pairs, geometry, settings, maps_key))
+    inputs = (features and features.key, pairs, geometry, settings, maps_key)
+    stored = run.stage("refined", key=key_of("refined", METHOD_VERSION, *inputs))
     with clock.stage("refinement", total=1) as stage:
         if stored.is_done:
             stage.skip(1)
@@ -200,7 +204,9 @@ def _wanted_pairs(
         else:
             wanted: set[Pair] = set()
             for surfaces in seen:
-                wanted |= set(select_pairs(surfaces, per_image=per_image, known=known))
+                # A backbone without features has matched nothing yet, not even neighbours.
+                near = set() if known else _next_images(surfaces)
+                wanted |= near | set(select_pairs(surfaces, per_image=per_image, known=near or known))
                 stage.advance()
             with stored.write() as folder:
                 write_json(folder / "pairs.json", sorted(wanted))
@@ -211,10 +217,13 @@ def _pairs_for_maps(seen: Sequence[Sequence[SeenSurface]], per_image: int) -> tu
     """The nearest neighbours in order, and the images of other passes that see the same surface."""
     pairs: set[Pair] = set()
     for surfaces in seen:
-        images = [surface.image for surface in surfaces]
-        pairs |= {(a, b) for step in range(1, NEXT_IMAGES + 1) for a, b in zip(images, images[step:], strict=False)}
-        pairs |= set(select_pairs(surfaces, per_image=per_image, known=()))
+        pairs |= _next_images(surfaces) | set(select_pairs(surfaces, per_image=per_image, known=()))
     return tuple(sorted(pairs))
+
+
+def _next_images(surfaces: Sequence[SeenSurface]) -> set[Pair]:
+    images = sorted(surface.image for surface in surfaces)
+    return {(a, b) for step in range(1, NEXT_IMAGES + 1) for a, b in zip(images, images[step:], strict=False)}
 
 
 # ------------------------------------------------------------------------- surfaces
@@ -309,6 +318,7 @@ def _not_refined(scenes: tuple[Scene, ...], folder: Path, reason: str) -> Refine
             registered=(),
             final=final,
             kept=False,
+            principal_point=STAYED,
             reason=reason,
         )
 

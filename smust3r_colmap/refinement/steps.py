@@ -32,6 +32,8 @@ MAX_MOVE = 0.2
 """Of the path's extent: a median camera that moves farther has left the scene."""
 FOCAL_RANGE = (0.5, 2.0)
 """An adjusted focal length outside of this, times the one before, has run away."""
+MAX_PRINCIPAL_POINT_SHIFT = 0.05
+"""Of the longer image side; real principal points lie within a percent or two of the middle."""
 MAX_DISTORTION = 1.0
 """COLMAP's own limit of a distortion parameter."""
 
@@ -129,20 +131,32 @@ def why_worse(model: pycolmap.Reconstruction, before: Snapshot, *, usable: bool)
     if not usable:
         return "the adjustment diverged"
     for camera_id, params in before.camera_params.items():
-        camera = model.camera(camera_id)
-        focal, extra = list(camera.focal_length_idxs()), list(camera.extra_params_idxs())
-        ratio = float(np.mean(np.asarray(camera.params)[focal]) / np.mean(params[focal]))
-        if not FOCAL_RANGE[0] <= ratio <= FOCAL_RANGE[1]:
-            return f"the focal length of camera {camera_id} went to {ratio:.2g} times what it was"
-        distortion, former = np.abs(np.asarray(camera.params)[extra]), np.abs(params[extra])
-        if (distortion > np.maximum(former, MAX_DISTORTION)).any():
-            return f"the distortion of camera {camera_id} went beyond {MAX_DISTORTION:g}"
+        if reason := _why_camera_ran_away(model.camera(camera_id), params):
+            return f"the {reason}"
     moved, _ = movement(model, before.rig_from_world)
     if len(moved) and np.median(moved) > 100 * MAX_MOVE:
         return f"the cameras moved by {np.median(moved):.0f} % of the path's extent in the median"
     good = num_good_observations(model)
     if good < (1 - MAX_LOST) * before.num_good:
         return f"only {good} of {before.num_good} good observations stayed good"
+    return ""
+
+
+def _why_camera_ran_away(camera: pycolmap.Camera, former: FloatArray) -> str:
+    """In words, or empty where its parameters are still those of a camera."""
+    params = np.asarray(camera.params)
+    focal, middle, extra = (
+        list(indices)
+        for indices in (camera.focal_length_idxs(), camera.principal_point_idxs(), camera.extra_params_idxs())
+    )
+    ratio = float(np.mean(params[focal]) / np.mean(former[focal]))
+    if not FOCAL_RANGE[0] <= ratio <= FOCAL_RANGE[1]:
+        return f"focal length of camera {camera.camera_id} went to {ratio:.2g} times what it was"
+    shift = float(np.linalg.norm(params[middle] - former[middle]))
+    if shift > MAX_PRINCIPAL_POINT_SHIFT * max(camera.width, camera.height):
+        return f"principal point of camera {camera.camera_id} went {shift:.0f} px away"
+    if (np.abs(params[extra]) > np.maximum(np.abs(former[extra]), MAX_DISTORTION)).any():
+        return f"distortion of camera {camera.camera_id} went beyond {MAX_DISTORTION:g}"
     return ""
 
 

@@ -23,15 +23,15 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from smust3r_colmap.errors import ImageError
 from smust3r_colmap.exporters.colmap_database import write_colmap_database
+from smust3r_colmap.exporters.colmap_sparse import write_binary_checked
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.importers.images import load_grey, load_rgb
 from smust3r_colmap.products import DepthMaps, FloatArray, ImageCollection, Scene
 from smust3r_colmap.refinement.adjustment import (
     FUNCTION_TOLERANCE,
-    MANY_OBSERVATIONS,
-    MIN_ANGLE_DEG,
     ROUGH_TOLERANCE,
     ModelFigures,
     Priors,
@@ -42,8 +42,16 @@ from smust3r_colmap.refinement.adjustment import (
     pose_priors,
     priors_of,
     triangulate,
-    triangulator_options,
     weak_images,
+)
+from smust3r_colmap.refinement.bench import (
+    LOOSE_PART,
+    TIGHT_PART,
+    Bench,
+    agrees,
+    cameras_of,
+    poses_of,
+    views_of,
 )
 from smust3r_colmap.refinement.completion import complete_model
 from smust3r_colmap.refinement.correspondences import Correspondences, Pair, joined
@@ -51,34 +59,32 @@ from smust3r_colmap.refinement.feature_matches import (
     MIN_VERIFIED,
     Consent,
     MatchedFeatures,
-    View,
     ask_consent,
     read_matched_features,
 )
 from smust3r_colmap.refinement.pointmap_matches import MappedView, match_by_pointmaps
 from smust3r_colmap.refinement.principal_point import ask_for_principal_points
+from smust3r_colmap.refinement.replacement import place_bent_images_again
 from smust3r_colmap.refinement.steps import MAX_ERROR_PX, StepReport, tried_step
 from smust3r_colmap.run_directory import StageFolder, write_json
 
 logger = logging.getLogger(__name__)
 
-LOOSE_PART = 0.012
-"""Epipolar and reprojection tolerance of the first round, as a part of the longer image side: what stitching leaves."""
-TIGHT_PART = 0.004
-"""Of the second round, when the cameras have been adjusted once."""
 LOOSE_ANGLE_DEG, TIGHT_ANGLE_DEG = 4.0, 2.0
+MIN_TIGHT_PX = 2.6
+"""Tolerance of tracks in the second round, in small images: features are no better placed in them."""
 FIRST_FILTER_PX = 8.0
 FIRST_ITERATIONS, SECOND_ITERATIONS, LAST_ITERATIONS, PART_ITERATIONS = 12, 30, 10, 6
 """Upper bounds; after so many the figures stand still to three digits on the sets tried."""
 MAP_KEYPOINTS = 1000
 """Corners of an image that are followed by pointmaps."""
-MIN_SEEN_POINTS, MIN_AGREEING_PART = 12, 0.6
-"""Points that place an image without a pose, and the part of its verified matches that must agree with the place."""
 MAX_LAST_ROUNDS, STILL_PERCENT = 4, 0.05
 """Filter and adjust again until no camera moves by more than this part of the path's extent: an image that wrong
 matches hold lets go of them one by one."""
 LARGE = 250
 """Images beyond which parts are adjusted before the whole."""
+STAYED = "kept where it was"
+REPLACEMENT = "images placed again"
 MODEL_FOLDER, DATABASE_FILE = "model", "database.db"
 
 
@@ -127,6 +133,7 @@ class RefinedFigures:
         registered: image indices that the stitched scene did not have.
         final: figures of the model as it is stored.
         kept: the refined model stands; False where it came out worse than the stitched one.
+        principal_point: what became of it, and why.
         reason: why not, or empty.
     """
 
@@ -138,6 +145,7 @@ class RefinedFigures:
     registered: tuple[int, ...]
     final: ModelFigures
     kept: bool
+    principal_point: str
     reason: str = ""
 
 
@@ -151,7 +159,7 @@ def refine_scenes(task: RefineTask) -> tuple[RefinedFigures, ...]:
         for number, outcome in enumerate(outcomes):
             model_folder = folder / str(number) / MODEL_FOLDER
             model_folder.mkdir(parents=True)
-            outcome.model.write_binary(model_folder)
+            write_binary_checked(outcome.model, model_folder)
         _write_database(task, features, outcomes, folder / DATABASE_FILE)
         figures = tuple(outcome.figures for outcome in outcomes)
         write_json(folder / "figures.json", figures)
@@ -210,137 +218,67 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
     cameras = tuple(scene.cameras.get(i, prior) for i, prior in enumerate(task.collection.cameras))
     of_scene = _without_images_of_other_scenes(features, scene, task.scenes)
     stitched = dict(zip(scene.image_indices, scene.cam_from_world, strict=True))
-    consent = ask_consent(of_scene, _views(stitched, cameras, task.collection), tolerance=task.tolerance)
-    bench = _Bench(task, cameras, consent, stitched, scratch)
+    consent = ask_consent(of_scene, views_of(stitched, cameras, task.collection), tolerance=task.tolerance)
+    bench = Bench(task.collection, cameras, consent, stitched, scratch=scratch, threads=task.threads)
     priors = priors_of(bench.model)
     steps = [_triangulation(bench, Tolerance(pixels=task.tolerance * _longer_side(task), angle_deg=LOOSE_ANGLE_DEG))]
     if not bench.model.num_points3D():
-        return _nothing_to_adjust(task, bench, consent, priors, steps)
+        return _nothing_to_adjust(bench, priors, steps)
     if len(scene) > LARGE:
         steps.append(tried_step("adjustment of parts", bench.model, lambda: _adjust_parts(bench.model, task)))
     steps.append(_adjustment("adjustment", bench.model, priors, task, FIRST_ITERATIONS, rough=True))
     bench.filter(FIRST_FILTER_PX)
 
-    tight = Tolerance(pixels=TIGHT_PART * _longer_side(task), angle_deg=TIGHT_ANGLE_DEG)
-    poses, cameras = _poses(bench.model), _cameras(bench.model, cameras)
-    consent = ask_consent(of_scene, _views(poses, cameras, task.collection), tolerance=TIGHT_PART)
+    tight = Tolerance(pixels=max(TIGHT_PART * _longer_side(task), MIN_TIGHT_PX), angle_deg=TIGHT_ANGLE_DEG)
+    poses, cameras = poses_of(bench.model), cameras_of(bench.model, cameras)
+    consent = ask_consent(of_scene, views_of(poses, cameras, task.collection), tolerance=TIGHT_PART)
     bench = bench.with_matches(consent)
     registered = bench.register_missing(of_scene, tight)
     steps.append(_triangulation(bench, tight, name="longer tracks"))
-    _drop_needless_pairs(bench)
+    bench.drop_needless_pairs()
     steps.append(_adjustment("second adjustment", bench.model, priors, task, SECOND_ITERATIONS, rough=True))
     bench.filter(MAX_ERROR_PX)
-    free = not task.calibrated and _is_principal_point_determined(bench.model, priors, task)
-    if free:
+    replacement = place_bent_images_again(bench, of_scene, tight)
+    bench = replacement.bench
+    if replacement.placed:
+        steps.append(_adjustment(REPLACEMENT, bench.model, priors, task, SECOND_ITERATIONS, rough=True))
+        bench.filter(MAX_ERROR_PX)
+    elif replacement.bent:
+        steps.append(_unchanged(REPLACEMENT, bench.model, replacement.summary))
+    why_not = _why_principal_points_stay(bench.model, priors, task)
+    if not why_not:
         moved = _adjustment("principal point", bench.model, priors, task, SECOND_ITERATIONS, principal_point=True)
         steps.append(moved)
-        free = moved.kept
+        why_not = moved.reason
         bench.filter(MAX_ERROR_PX)
+    free = not why_not
+    principal_point = f"{STAYED}: {why_not}" if why_not else "free: two halves of the points agree where it is"
     for _ in range(MAX_LAST_ROUNDS):
         bench.complete(tight)
-        _drop_needless_pairs(bench)
+        bench.drop_needless_pairs()
         last = _adjustment("last adjustment", bench.model, priors, task, LAST_ITERATIONS, principal_point=free)
         steps.append(last)
         bench.filter(min(MAX_ERROR_PX, tight.pixels))
         if last.max_moved_percent < STILL_PERCENT or not last.kept:
             break
-    return _finished(task, bench, consent, priors, stitched, steps, registered)
+    return _finished(task, bench, priors, stitched, steps, registered, principal_point)
 
 
-class _Bench:
-    """pycolmap's mapper on the matches that have consent; the objects that it needs live as long as it does."""
-
-    def __init__(
-        self,
-        task: RefineTask,
-        cameras: Sequence[Intrinsics],
-        consent: Consent,
-        cam_from_world: Mapping[int, FloatArray],
-        scratch: Path,
-        model: pycolmap.Reconstruction | None = None,
-    ) -> None:
-        self.task, self.scratch = task, scratch
-        with tempfile.TemporaryDirectory(dir=scratch) as folder:
-            path = Path(folder) / DATABASE_FILE
-            write_colmap_database(
-                path,
-                task.collection,
-                cameras,
-                keypoints=consent.correspondences.keypoints,
-                matches=consent.correspondences.matches,
-                j_from_i={},
-                priors=(),
-            )
-            with pycolmap.Database.open(path) as database:
-                self._cache = pycolmap.DatabaseCache.create(
-                    database, pycolmap.DatabaseCacheOptions(min_num_matches=1, load_all_images=True)
-                )
-        if model is None:
-            model = pycolmap.Reconstruction()
-            model.load(self._cache)
-            for index, pose in cam_from_world.items():
-                model.frame(index + 1).rig_from_world = pycolmap.Rigid3d(pose)
-                model.register_frame(index + 1)
-        self.model = model
-        self.mapper = pycolmap.IncrementalMapper(self._cache)
-        self.mapper.begin_reconstruction(model)
-
-    def with_matches(self, consent: Consent) -> _Bench:
-        """The same model with other matches."""
-        self.mapper.end_reconstruction(False)
-        cameras = _cameras(self.model, self.task.collection.cameras)
-        return _Bench(self.task, cameras, consent, {}, self.scratch, self.model)
-
-    def filter(self, pixels: float) -> None:
-        """Leave out observations that are too far off and points that are seen under no angle."""
-        self.mapper.observation_manager.filter_all_points3D(pixels, MIN_ANGLE_DEG)
-
-    def complete(self, tolerance: Tolerance) -> None:
-        """Longer tracks."""
-        self.mapper.complete_and_merge_tracks(triangulator_options(tolerance))
-
-    def register_missing(self, features: MatchedFeatures, tolerance: Tolerance) -> tuple[int, ...]:
-        """Place images that have no pose by the points they see; returns their indices.
-
-        Fewer points than COLMAP asks for are enough, because most of the image's matches must agree afterwards.
-        """
-        options = pycolmap.IncrementalMapperOptions()
-        options.random_seed = 0
-        options.num_threads = self.task.threads
-        options.abs_pose_min_num_inliers = MIN_SEEN_POINTS
-        options.abs_pose_refine_focal_length = options.abs_pose_refine_extra_params = False
-        found: list[int] = []
-        while True:
-            candidates = self.mapper.find_next_images(options, False)
-            new = [i for i in candidates if self._register(options, features, i)]
-            for image_id in new:
-                self.mapper.triangulate_image(triangulator_options(tolerance), image_id)
-            found += new
-            if not new:
-                return tuple(sorted(i - 1 for i in found))
-
-    def _register(self, options: pycolmap.IncrementalMapperOptions, features: MatchedFeatures, image_id: int) -> bool:
-        if not self.mapper.register_next_image(options, image_id):
-            return False
-        if _agrees(self.task, features, self.model, image_id):
-            return True
-        self.mapper.observation_manager.deregister_frame(self.model.image(image_id).frame_id)
-        return False
+def _unchanged(name: str, model: pycolmap.Reconstruction, reason: str) -> StepReport:
+    figures = figures_of(model)
+    return StepReport(
+        name=name,
+        before=figures,
+        after=figures,
+        moved_percent=0.0,
+        max_moved_percent=0.0,
+        turned_deg=0.0,
+        kept=False,
+        reason=reason,
+    )
 
 
-def _agrees(task: RefineTask, features: MatchedFeatures, model: pycolmap.Reconstruction, image_id: int) -> bool:
-    """Most verified matches of the image with others that have a pose lie on their epipolar lines."""
-    poses = _poses(model)
-    around = {
-        pair: rows for pair, rows in features.verified.items() if image_id - 1 in pair and all(i in poses for i in pair)
-    }
-    near = {i: poses[i] for pair in around for i in pair}
-    views = _views(near, _cameras(model, task.collection.cameras), task.collection)
-    consent = ask_consent(replace(features, raw=around, verified=around), views, tolerance=LOOSE_PART)
-    return consent.correspondences.num_matches >= MIN_AGREEING_PART * max(sum(map(len, around.values())), 1)
-
-
-def _triangulation(bench: _Bench, tolerance: Tolerance, *, name: str = "triangulation") -> StepReport:
+def _triangulation(bench: Bench, tolerance: Tolerance, *, name: str = "triangulation") -> StepReport:
     before = figures_of(bench.model)
     triangulate(bench.mapper, tolerance)
     return StepReport(
@@ -378,13 +316,13 @@ def _adjustment(
     return tried_step(name, model, step)
 
 
-def _is_principal_point_determined(model: pycolmap.Reconstruction, priors: Priors, task: RefineTask) -> bool:
-    """Whether the model determines them, which the log says why."""
+def _why_principal_points_stay(model: pycolmap.Reconstruction, priors: Priors, task: RefineTask) -> str:
+    """In words, or empty where the model determines them."""
+    if task.calibrated:
+        return "the intrinsics are given"
     if not task.principal_point:
-        return False
-    answer = ask_for_principal_points(model, priors, threads=task.threads)
-    logger.info("principal point: %s", answer.reason or "free")
-    return not answer.reason
+        return "as was asked for"
+    return ask_for_principal_points(model, priors, threads=task.threads).reason
 
 
 def _adjust_parts(model: pycolmap.Reconstruction, task: RefineTask) -> bool:
@@ -393,59 +331,59 @@ def _adjust_parts(model: pycolmap.Reconstruction, task: RefineTask) -> bool:
     return all(adjust_part(model, part, max_iterations=PART_ITERATIONS, threads=task.threads) for part in parts if part)
 
 
-def _nothing_to_adjust(
-    task: RefineTask, bench: _Bench, consent: Consent, priors: Priors, steps: list[StepReport]
-) -> _Outcome:
+def _nothing_to_adjust(bench: Bench, priors: Priors, steps: list[StepReport]) -> _Outcome:
     reason = "no point could be triangulated: too few matches, or a camera that only turned"
     figures = RefinedFigures(
         steps=tuple(steps),
-        num_pairs=len(consent.correspondences.matches),
-        num_matches=consent.correspondences.num_matches,
-        num_refused_pairs=len(consent.refused),
+        num_pairs=len(bench.consent.correspondences.matches),
+        num_matches=bench.consent.correspondences.num_matches,
+        num_refused_pairs=len(bench.consent.refused),
         weak=tuple(i - 1 for i in weak_images(bench.model)),
         registered=(),
         final=figures_of(bench.model),
         kept=False,
+        principal_point=STAYED,
         reason=reason,
     )
-    return _Outcome(model=bench.model, consent=consent, priors=priors, figures=figures)
+    return _Outcome(model=bench.model, consent=bench.consent, priors=priors, figures=figures)
 
 
 def _finished(
     task: RefineTask,
-    bench: _Bench,
-    consent: Consent,
+    bench: Bench,
     priors: Priors,
     stitched: Mapping[int, FloatArray],
     steps: list[StepReport],
     registered: tuple[int, ...],
+    principal_point: str,
 ) -> _Outcome:
     model = bench.model
     _put_back_weak_images(model, stitched)
     bench.filter(MAX_ERROR_PX)  # from where it stands now, a weak image does not see all that it saw
-    _drop_needless_pairs(bench)
+    bench.drop_needless_pairs()
     weak = weak_images(model)
     some_sound = len(weak) < model.num_reg_images()
     bench.mapper.end_reconstruction(False)
     _colour(model, task.collection)
     figures = RefinedFigures(
         steps=tuple(steps),
-        num_pairs=len(consent.correspondences.matches),
-        num_matches=consent.correspondences.num_matches,
-        num_refused_pairs=len(consent.refused),
+        num_pairs=len(bench.consent.correspondences.matches),
+        num_matches=bench.consent.correspondences.num_matches,
+        num_refused_pairs=len(bench.consent.refused),
         weak=tuple(i - 1 for i in weak),
         registered=tuple(i for i in registered if i + 1 in model.reg_image_ids()),
         final=figures_of(model),
         kept=some_sound,
+        principal_point=principal_point,
         reason="" if some_sound else "no image sees enough points to be adjusted by",
     )
-    return _Outcome(model=model, consent=consent, priors=priors, figures=figures)
+    return _Outcome(model=model, consent=bench.consent, priors=priors, figures=figures)
 
 
 def _completed(task: RefineTask, features: MatchedFeatures, outcomes: Sequence[_Outcome], scratch: Path) -> _Outcome:
     """The largest model with those of the images that no model has which COLMAP's mapper can add."""
     largest = outcomes[0]
-    placed = {i for outcome in outcomes for i in _poses(outcome.model)}
+    placed = {i for outcome in outcomes for i in poses_of(outcome.model)}
     if len(placed) == len(task.collection):
         return largest
     with tempfile.TemporaryDirectory(dir=scratch) as folder:
@@ -453,7 +391,7 @@ def _completed(task: RefineTask, features: MatchedFeatures, outcomes: Sequence[_
         write_colmap_database(
             database,
             task.collection,
-            _cameras(largest.model, task.collection.cameras),
+            cameras_of(largest.model, task.collection.cameras),
             keypoints=largest.consent.correspondences.keypoints,
             matches=largest.consent.correspondences.matches,
             j_from_i={},
@@ -462,7 +400,7 @@ def _completed(task: RefineTask, features: MatchedFeatures, outcomes: Sequence[_
         completion = complete_model(
             largest.model,
             database,
-            agrees=lambda model, image_id: _agrees(task, features, model, image_id),
+            agrees=lambda model, image_id: agrees(features, model, image_id, task.collection),
             scratch=scratch,
             threads=task.threads,
         )
@@ -480,27 +418,6 @@ def _completed(task: RefineTask, features: MatchedFeatures, outcomes: Sequence[_
         final=completion.report.after,
     )
     return replace(largest, model=completion.model, figures=figures)
-
-
-def _drop_needless_pairs(bench: _Bench) -> None:
-    """Remove points that two images see only, where both have enough others.
-
-    Two rays meet wherever the epipolar lines allow, so wrong matches of a repetitive facade look as good as right
-    ones and hold an image where it does not belong.
-    """
-    model = bench.model
-    longer = dict.fromkeys(model.reg_image_ids(), 0)
-    short = []
-    for point_id, point in model.points3D.items():
-        images = {element.image_id for element in point.track.elements}
-        if len(images) > 2:
-            for image_id in images:
-                longer[image_id] += 1
-        else:
-            short.append((point_id, images))
-    for point_id, images in short:
-        if len(images) < 2 or all(longer[i] >= MANY_OBSERVATIONS for i in images):
-            bench.mapper.observation_manager.delete_point3D(point_id)
 
 
 def _put_back_weak_images(model: pycolmap.Reconstruction, stitched: Mapping[int, FloatArray]) -> None:
@@ -531,7 +448,11 @@ def _colour(model: pycolmap.Reconstruction, collection: ImageCollection) -> None
         seen = [(point.point3D_id, point.xy) for point in image.points2D if point.has_point3D()]
         if not seen:
             continue
-        rgb = load_rgb(collection.images[image_id - 1])
+        try:
+            rgb = load_rgb(collection.images[image_id - 1])
+        except ImageError as error:
+            logger.warning("its points are coloured by other images: %s", error)
+            continue
         xy = np.array([place for _, place in seen])
         column = np.clip(xy[:, 0].astype(np.int64), 0, rgb.shape[1] - 1)
         row = np.clip(xy[:, 1].astype(np.int64), 0, rgb.shape[0] - 1)
@@ -543,27 +464,10 @@ def _colour(model: pycolmap.Reconstruction, collection: ImageCollection) -> None
 
 
 # ------------------------------------------------------------------------- helpers
-def _views(
-    poses: Mapping[int, FloatArray], cameras: Sequence[Intrinsics], collection: ImageCollection
-) -> dict[int, View]:
-    return {i: View(cam_from_world=pose, intrinsics=cameras[collection.images[i].camera]) for i, pose in poses.items()}
-
-
-def _poses(model: pycolmap.Reconstruction) -> dict[int, FloatArray]:
-    return {i - 1: model.image(i).cam_from_world().matrix() for i in sorted(model.reg_image_ids())}
-
-
-def _cameras(model: pycolmap.Reconstruction, priors: Sequence[Intrinsics]) -> tuple[Intrinsics, ...]:
-    return tuple(
-        Intrinsics.from_colmap(model.camera(index + 1)) if index + 1 in model.cameras else prior
-        for index, prior in enumerate(priors)
-    )
-
-
 def _adjusted_cameras(model: pycolmap.Reconstruction, priors: Sequence[Intrinsics]) -> tuple[Intrinsics, ...]:
-    """As ``_cameras``; a focal length that images have adjusted is a good prior, and global mapping asks for one."""
+    """As ``cameras_of``; a focal length that images have adjusted is a good prior, and global mapping asks for one."""
     used = {model.image(i).camera_id - 1 for i in model.reg_image_ids()}
-    cameras = _cameras(model, priors)
+    cameras = cameras_of(model, priors)
     return tuple(replace(one, has_prior_focal=one.has_prior_focal or k in used) for k, one in enumerate(cameras))
 
 
@@ -585,7 +489,7 @@ def _without_images_of_other_scenes(
 
 def _write_database(task: RefineTask, features: MatchedFeatures, outcomes: Sequence[_Outcome], path: Path) -> None:
     """All images; per scene the matches it consents to, between scenes and images without a pose the verified ones."""
-    scene_of = {i: number for number, outcome in enumerate(outcomes) for i in _poses(outcome.model)}
+    scene_of = {i: number for number, outcome in enumerate(outcomes) for i in poses_of(outcome.model)}
     matches = {
         pair: rows
         for pair, rows in features.verified.items()
@@ -593,7 +497,7 @@ def _write_database(task: RefineTask, features: MatchedFeatures, outcomes: Seque
     }
     j_from_i: dict[Pair, FloatArray] = {}
     for outcome in reversed(outcomes):
-        poses = _poses(outcome.model)
+        poses = poses_of(outcome.model)
         within = {
             pair: rows
             for pair, rows in outcome.consent.correspondences.matches.items()
