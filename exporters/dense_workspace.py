@@ -380,19 +380,24 @@ def _window_sums(inverse: FloatMap, known: npt.NDArray[np.bool_]) -> FloatMap:
     """
     height, width = inverse.shape
     padded = np.pad(inverse, NORMAL_RADIUS)
+    tolerance = np.where(known, np.float32(SAME_SURFACE) * inverse, np.float32(-1))
     sums = np.zeros((9, height, width), np.float32)
     for dy in range(-NORMAL_RADIUS, NORMAL_RADIUS + 1):
+        # Sums over one row of the window, of 1, dx, dx dx and of d, dx d; its counts fit 8 bits.
+        counts, changes = np.zeros((3, height, width), np.int8), np.zeros((2, height, width), np.float32)
         for dx in range(-NORMAL_RADIUS, NORMAL_RADIUS + 1):
             top, left = NORMAL_RADIUS + dy, NORMAL_RADIUS + dx
             change = padded[top : top + height, left : left + width] - inverse
-            same = (np.abs(change) <= SAME_SURFACE * inverse) & known
-            change = np.where(same, change, np.float32(0))
-            for row, factor in enumerate((1, dx, dy, dx * dx, dx * dy, dy * dy)):
-                if factor:
-                    sums[row] += np.float32(factor) * same
-            for row, factor in enumerate((1, dx, dy), start=6):
-                if factor:
-                    sums[row] += np.float32(factor) * change
+            same = np.abs(change) <= tolerance
+            change *= same
+            for power in range(3):
+                counts[power] += np.int8(dx**power) * same
+            for power in range(2):
+                changes[power] += np.float32(dx**power) * change
+        (n, x, xx), (d, xd) = counts, changes
+        of_row = ((n, 1), (x, 1), (n, dy), (xx, 1), (x, dy), (n, dy * dy), (d, 1), (xd, 1), (d, dy))
+        for number, (along_x, factor) in enumerate(of_row):
+            sums[number] += np.float32(factor) * along_x
     return sums
 
 

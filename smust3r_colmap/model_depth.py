@@ -14,6 +14,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,6 +32,7 @@ logger = logging.getLogger(__name__)
 FloatArray = npt.NDArray[np.float64]
 FloatMap = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
+AnyFloats = npt.NDArray[np.floating[Any]]
 
 DEPTH_EDGE = 0.03
 """Neighbouring pixels of a map whose depths differ by more than this part are taken for two surfaces: between
@@ -53,7 +55,8 @@ have the same errors and confirm anything."""
 CANDIDATES_PER_NEIGHBOUR = 3
 """Views with most shared points whose parallax is looked at, for each neighbour wanted."""
 CACHE_BYTES = 256 << 20
-"""Carried maps kept in memory: a few hundred of the usual size, and never fewer than two."""
+"""Carried maps kept in memory, with what they are looked up by: two hundred of the usual size, and never fewer than
+two."""
 LARGEST_TURN = 0.5
 """Cosine between viewing directions from which on two cameras without common points may see the same."""
 
@@ -115,11 +118,11 @@ def _iterate(
     names: Mapping[int, str],
     scales: Mapping[int, _Scale],
     views: Mapping[int, _View],
-    carried: Callable[[int], FloatMap],
+    carried: Callable[[int], _DepthLookup],
     neighbours: Mapping[int, Sequence[int]] | None,
 ) -> Iterator[ModelDepth]:
     for i, name in names.items():
-        depth = carried(i)
+        depth = carried(i).depth
         if neighbours is not None:
             depth = _confirmed(depth, views[i], [(views[j], carried(j)) for j in neighbours[i]])
         yield ModelDepth(name=name, depth=depth, scale=scales[i].factor, num_points=scales[i].num_points)
@@ -145,10 +148,7 @@ def _names_with_maps(
 
 # ---------------------------------------------------------------------------- sampling
 def sample_depth(depth: FloatMap, columns: FloatArray, rows: FloatArray) -> FloatMap:
-    """Depth at places of a map, never blended across an edge.
-
-    Inverse depth is interpolated, which on a plane is exact; where the four pixels round the place are not one
-    surface (``DEPTH_EDGE``, or one has no depth) the nearest is taken.
+    """Depth at places of a map, never blended across an edge; see ``_DepthLookup``.
 
     Args:
         depth: (H, W), 0 where there is none.
@@ -157,24 +157,63 @@ def sample_depth(depth: FloatMap, columns: FloatArray, rows: FloatArray) -> Floa
     Returns:
         (N,) float32, 0 outside the map and where there is no depth.
     """
-    height, width = depth.shape
-    with np.errstate(invalid="ignore"):
-        inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    x, y = columns[inside], rows[inside]
-    found = depth[y.astype(np.intp), x.astype(np.intp)]
-    # The pixel whose centre is to the left and above; the outermost half pixel has no other side.
-    left, top = np.maximum(x - 0.5, 0), np.maximum(y - 0.5, 0)
-    j, i = left.astype(np.intp), top.astype(np.intp)
-    smooth = _one_surface(depth)[i, j]
-    i, j, right, down = i[smooth], j[smooth], left[smooth], top[smooth]
-    i_below, j_right = np.minimum(i + 1, height - 1), np.minimum(j + 1, width - 1)
-    right, down = (right - j).astype(np.float32), (down - i).astype(np.float32)
-    upper = (1 - right) / depth[i, j] + right / depth[i, j_right]
-    lower = (1 - right) / depth[i_below, j] + right / depth[i_below, j_right]
-    found[smooth] = 1 / ((1 - down) * upper + down * lower)
-    everywhere = np.zeros(len(columns), np.float32)
-    everywhere[inside] = found
-    return everywhere
+    inverse = _DepthLookup.of(depth).inverse_depth(columns, rows)
+    return np.divide(1, inverse, out=inverse, where=inverse > 0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _DepthLookup:
+    """A depth map made ready to be asked at any place.
+
+    Inverse depth is interpolated, which on a plane is exact; where the four pixels round the place are not one
+    surface (``DEPTH_EDGE``, or one has no depth) the nearest is taken.
+
+    Args:
+        depth: (H, W), 0 where there is none.
+        inverse: (H + 1, W + 1) float32 inverse depth, 0 where there is none; the last row and column stand there
+            twice, so that every pixel has one to the right and one below.
+        smooth: (H + 1, W + 1) whether a pixel, the next to the right, and the two below them are one surface.
+    """
+
+    depth: FloatMap
+    inverse: FloatMap
+    smooth: npt.NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, depth: FloatMap) -> _DepthLookup:
+        """Of a map that is not changed any more."""
+        rim = ((0, 1), (0, 1))
+        inverse = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
+        return cls(depth=depth, inverse=np.pad(inverse, rim, mode="edge"), smooth=np.pad(_one_surface(depth), rim))
+
+    @property
+    def nbytes(self) -> int:
+        return self.depth.nbytes + self.inverse.nbytes + self.smooth.nbytes
+
+    def inverse_depth(self, x: AnyFloats, y: AnyFloats) -> FloatMap:
+        """(N,) float32 at places (N,) with the centre of the first pixel at (0.5, 0.5); 0 outside and without depth."""
+        height, width = self.depth.shape
+        with np.errstate(invalid="ignore"):
+            inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        x, y = x[inside], y[inside]
+        # The pixel whose centre is to the left and above; the outermost half pixel has no other side.
+        left, top = np.maximum(x - 0.5, 0), np.maximum(y - 0.5, 0)
+        j, i = left.astype(np.intp), top.astype(np.intp)
+        right, down = (left - j).astype(np.float32), (top - i).astype(np.float32)
+        inverse, stride = self.inverse.ravel(), width + 1
+        corner = i * stride + j
+        upper, lower = (_blended(inverse.take(row), inverse.take(row + 1), right) for row in (corner, corner + stride))
+        found = _blended(upper, lower, down)
+        rough = np.flatnonzero(~self.smooth.ravel().take(corner))
+        found[rough] = inverse[y[rough].astype(np.intp) * stride + x[rough].astype(np.intp)]
+        everywhere = np.zeros(len(inside), np.float32)
+        everywhere[inside] = found
+        return everywhere
+
+
+def _blended(first: FloatMap, second: FloatMap, part: FloatMap) -> FloatMap:
+    """``first`` where ``part`` is 0, ``second`` where it is 1."""
+    return first + part * (second - first)
 
 
 def _one_surface(depth: FloatMap) -> npt.NDArray[np.bool_]:
@@ -198,7 +237,7 @@ def _carried_maps(
     undistorted: pycolmap.Reconstruction,
     maps: DepthMaps,
     scales: Mapping[int, _Scale],
-) -> Callable[[int], FloatMap]:
+) -> Callable[[int], _DepthLookup]:
     """A function from image id to its rescaled depth in the undistorted view, which keeps the last results."""
 
     @lru_cache(maxsize=4)  # images of one camera follow each other; a lookup takes 16 bytes per pixel
@@ -209,24 +248,24 @@ def _carried_maps(
         xy = Intrinsics.from_colmap(distorted).xy_img(rays)
         return xy / (distorted.width, distorted.height)
 
-    def carry(i: int) -> FloatMap:
+    def carry(i: int) -> _DepthLookup:
         pinhole = undistorted.camera(undistorted.image(i).camera_id)
         depth = _evident_depth(maps, original.image(i).name)
         columns, rows = (places(original.image(i).camera_id, pinhole.camera_id) * depth.shape[::-1]).T
         sampled: FloatMap = sample_depth(depth, columns, rows) * np.float32(scales[i].factor)
-        return sampled.reshape(pinhole.height, pinhole.width)
+        return _DepthLookup.of(sampled.reshape(pinhole.height, pinhole.width))
 
     return _with_bounded_memory(carry)
 
 
-def _with_bounded_memory(carry: Callable[[int], FloatMap]) -> Callable[[int], FloatMap]:
+def _with_bounded_memory(carry: Callable[[int], _DepthLookup]) -> Callable[[int], _DepthLookup]:
     """The same function, which remembers the last results up to ``CACHE_BYTES``."""
-    cache: OrderedDict[int, FloatMap] = OrderedDict()
+    cache: OrderedDict[int, _DepthLookup] = OrderedDict()
 
-    def remembered(i: int) -> FloatMap:
+    def remembered(i: int) -> _DepthLookup:
         if i not in cache:
             cache[i] = carry(i)
-            while len(cache) > 2 and sum(depth.nbytes for depth in cache.values()) > CACHE_BYTES:
+            while len(cache) > 2 and sum(lookup.nbytes for lookup in cache.values()) > CACHE_BYTES:
                 cache.popitem(last=False)
         cache.move_to_end(i)
         return cache[i]
@@ -254,7 +293,7 @@ class _Sightings:
         row_of = {point_id: row for row, point_id in enumerate(model.points3D)}
         points, xy = {}, {}
         for i in images:
-            observed = [(row_of[p.point3D_id], *p.xy) for p in model.image(i).points2D if p.has_point3D()]
+            observed = [(row_of[p.point3D_id], *p.xy) for p in model.image(i).get_observation_points2D()]
             table = np.array(observed, dtype=np.float64).reshape(-1, 3)
             points[i], xy[i] = table[:, 0].astype(np.int64), table[:, 1:]
         return cls(
@@ -347,24 +386,29 @@ class _View:
         return other.img_from_cam @ rotation @ np.linalg.inv(self.img_from_cam), other.img_from_cam @ translation
 
 
-def _confirmed(depth: FloatMap, view: _View, others: Sequence[tuple[_View, FloatMap]]) -> FloatMap:
-    """The depth that enough of the other views confirm, 0 elsewhere; pixels are left alone once they have enough."""
-    rows, columns = np.nonzero(depth)
-    xy1 = np.column_stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
-    z = depth[rows, columns].astype(np.float64)
-    needed = min(CONFIRMATIONS, len(others))
-    count = np.zeros(len(rows), np.int64)
-    for other_view, other_depth in others:
-        unsure = np.flatnonzero(count < needed)
-        matrix, offset = view.transfer_to(other_view)
-        seen = z[unsure, None] * (xy1[unsure] @ matrix.T) + offset
+def _confirmed(depth: FloatMap, view: _View, others: Sequence[tuple[_View, _DepthLookup]]) -> FloatMap:
+    """The depth that enough of the other views confirm, 0 elsewhere; pixels are left alone once they have enough.
+
+    Without another view there is nobody to ask, and all stays. In single precision, which is exact to a thousandth of
+    a pixel.
+    """
+    if not others:
+        return depth
+    unsure = np.flatnonzero(depth)
+    rows, columns = np.divmod(unsure, depth.shape[1])
+    xy1 = np.stack([columns + 0.5, rows + 0.5, np.ones(len(unsure))]).astype(np.float32)
+    z = depth.ravel()[unsure]
+    missing = np.full(len(unsure), min(CONFIRMATIONS, len(others)), np.int8)
+    for other_view, other in others:
+        matrix, offset = (array.astype(np.float32) for array in view.transfer_to(other_view))
+        x, y, z_other = z * (matrix @ xy1) + offset[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
-            x_other, y_other = np.where(seen[:, 2:] > 0, seen[:, :2] / seen[:, 2:], np.nan).T
-        found = sample_depth(other_depth, x_other, y_other)
-        count[unsure] += np.abs(found - seen[:, 2]) <= AGREEMENT * seen[:, 2]
-    kept = np.zeros_like(depth)
-    sure = count >= needed
-    kept[rows[sure], columns[sure]] = depth[rows[sure], columns[sure]]
+            found = z_other * other.inverse_depth(x / z_other, y / z_other)  # 1 where it is as deep there
+        missing -= (found >= 1 / (1 + AGREEMENT)) & (found <= 1 / (1 - AGREEMENT))
+        left = missing > 0
+        unsure, xy1, z, missing = unsure[left], xy1[:, left], z[left], missing[left]
+    kept: FloatMap = depth.copy()
+    kept.ravel()[unsure] = 0
     return kept
 
 

@@ -151,6 +151,22 @@ def test_normal_maps_are_those_of_the_surfaces_and_face_the_camera(written: Writ
         assert np.percentile(angle_deg, 95) < 10
 
 
+def test_window_sums_are_those_of_every_window_by_itself() -> None:
+    rng = np.random.default_rng(4)
+    inverse = rng.uniform(0.93, 1.07, (11, 9)).astype(np.float32)
+    inverse[rng.random(inverse.shape) < 0.2] = 0
+    found = dense_workspace._window_sums(inverse, inverse > 0)
+    expected = np.zeros((9, 11, 9))
+    for (i, j), middle in np.ndenumerate(inverse):
+        for (k, m), value in np.ndenumerate(inverse):
+            dy, dx, change = k - i, m - j, float(value) - float(middle)
+            in_window = max(abs(dx), abs(dy)) <= dense_workspace.NORMAL_RADIUS
+            if middle > 0 and in_window and abs(change) <= dense_workspace.SAME_SURFACE * middle:
+                expected[:, i, j] += 1, dx, dy, dx * dx, dx * dy, dy * dy, change, dx * change, dy * change
+    assert 5 < expected[0].mean() < 40
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
 def test_normals_of_noisy_planes_are_right_at_every_slant() -> None:
     camera = np.array([[140.0, 0, 82], [0, 150, 59], [0, 0, 1]])
     rays = np.column_stack([pixel_centres(160, 120), np.ones(160 * 120)]) @ np.linalg.inv(camera).T

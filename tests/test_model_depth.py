@@ -96,6 +96,30 @@ def test_a_plane_is_sampled_exactly_and_outside_is_nothing() -> None:
     np.testing.assert_array_equal(outside, 0)
 
 
+def depth_by_the_rule(depth: FloatMap, x: float, y: float) -> float:
+    """What ``sample_depth`` promises, for one place."""
+    height, width = depth.shape
+    if not (0 <= x < width and 0 <= y < height):
+        return 0.0
+    j, i = int(max(x - 0.5, 0)), int(max(y - 0.5, 0))
+    four = depth[np.ix_([i, min(i + 1, height - 1)], [j, min(j + 1, width - 1)])].astype(np.float64)
+    if four.min() <= 0 or four.max() > four.min() * (1 + model_depth.DEPTH_EDGE):
+        return float(depth[int(y), int(x)])
+    right, down = max(x - 0.5, 0) - j, max(y - 0.5, 0) - i
+    return float(1 / (np.array([1 - down, down]) @ (1 / four) @ np.array([1 - right, right])))
+
+
+def test_every_place_is_sampled_by_the_rule_at_edges_holes_and_the_rim() -> None:
+    rng = np.random.default_rng(5)
+    depth = rng.choice([2.0, 3.0], (7, 9), p=[0.8, 0.2]) * rng.uniform(1.0, 1.02, (7, 9))
+    depth[rng.random((7, 9)) < 0.1] = 0
+    columns, rows = rng.uniform(-0.5, [9.5, 7.5], (600, 2)).T
+    expected = [depth_by_the_rule(depth.astype(np.float32), *place) for place in zip(columns, rows, strict=True)]
+    assert 0.1 < np.mean(np.array(expected) == 0) < 0.5
+    found = sample_depth(depth.astype(np.float32), columns, rows)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
 def test_pixels_of_which_nothing_is_known_stay_without_depth(
     model: pycolmap.Reconstruction, pinholes: pycolmap.Reconstruction
 ) -> None:

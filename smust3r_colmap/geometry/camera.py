@@ -8,6 +8,7 @@ Camera axes: x right, y down, z forward.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -122,9 +123,17 @@ def pointmap_from_depth(
     if z.shape != (intrinsics.height, intrinsics.width):
         raise ValueError(f"depth is {z.shape}, intrinsics are for {(intrinsics.height, intrinsics.width)}")
     pose = np.asarray(frame_from_cam, dtype=np.float64)
-    rays = intrinsics.rays_cam(pixel_centres(intrinsics.width, intrinsics.height))
+    rays = _pixel_rays_cam(intrinsics)
     z = np.where(np.isfinite(z) & (z > 0), z, np.nan)
     points_cam = rays * z.reshape(-1, 1)
     points = points_cam @ pose[:, :3].T + pose[:, 3]
     pointmap: npt.NDArray[np.float32] = points.reshape(*z.shape, 3).astype(np.float32)
     return pointmap
+
+
+@lru_cache(maxsize=2)  # undistortion iterates, and images of one camera follow each other
+def _pixel_rays_cam(intrinsics: Intrinsics) -> FloatArray:
+    """(height * width, 3) directions with z = 1 of all pixels, read-only."""
+    rays = intrinsics.rays_cam(pixel_centres(intrinsics.width, intrinsics.height))
+    rays.flags.writeable = False
+    return rays
