@@ -23,7 +23,7 @@ from typing import Annotated
 import tyro
 
 from smust3r_colmap import __version__
-from smust3r_colmap.config import ClassicalConfig, RunConfig
+from smust3r_colmap.config import ClassicalConfig, RunConfig, SegmentationConfig
 from smust3r_colmap.config_file import flags_from_settings, read_settings
 from smust3r_colmap.errors import ConfigError, InputError, SmustrError
 from smust3r_colmap.export_command import Export, run_export
@@ -42,7 +42,10 @@ EXIT_INTERRUPTED = 130
 _DEMO_WEAK_PERCENT = 5.0
 
 # The demo's walls are covered with texture; a quarter of the features does, in a third of the time.
-_DEMO_SETTINGS = RunConfig(classical=ClassicalConfig(max_features=1500))
+_DEMO_SETTINGS = RunConfig(
+    classical=ClassicalConfig(max_features=1500),
+    segmentation=SegmentationConfig(segment_length=20, overlap=10),  # enough segments for a loop
+)
 
 _DESCRIPTION = """Offline structure from motion for COLMAP workflows, segment by segment.
 
@@ -75,7 +78,7 @@ class Demo:
 
     output: Annotated[Path, tyro.conf.arg(metavar="OUT")] = Path("demo_out")
     """Folder for the images, the truth and the result."""
-    num_images: int = 120
+    num_images: int = 80
     """Images on the way round the room."""
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the figures, warnings and errors only."""
