@@ -27,6 +27,7 @@ from smust3r_colmap.errors import ImageError, InputError
 from smust3r_colmap.execution import usable_cores
 from smust3r_colmap.exporters.centred_pinhole import CentredPinhole, resampled
 from smust3r_colmap.importers.images import load_rgb
+from smust3r_colmap.importers.masks import find_mask, load_mask
 from smust3r_colmap.products import SourceImage
 
 UInt8Array = npt.NDArray[np.uint8]
@@ -113,13 +114,6 @@ def _orientation(head: Image.Image) -> int:
         return 1
 
 
-def find_mask(masks: Path, image: TrainerImage) -> Path | None:
-    """COLMAP's rule: ``<name>.png``, else ``<name without suffix>.png``, below the folder of masks."""
-    name = PurePosixPath(image.source.name)
-    candidates = (masks / f"{name}.png", masks / name.with_suffix(".png"))
-    return next((path for path in candidates if path.is_file()), None)
-
-
 # ----------------------------------------------------------------------------- writing
 def write_images(images: Sequence[tuple[TrainerImage, str]], folder: Path, scales: Sequence[int]) -> None:
     """Write ``images/<new name>`` and, for each scale, ``images_<scale>/<new name>`` below ``folder``.
@@ -156,7 +150,7 @@ def write_masks(
     """
     _make_folders(folder, "masks", scales)
     _each_camera_at_once(images, partial(_write_mask, masks, folder, scales))
-    return tuple(image.source.name for image, _ in images if find_mask(masks, image) is None)
+    return tuple(image.source.name for image, _ in images if find_mask(masks, image.source.name) is None)
 
 
 def encoded(suffix: str, pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> bytes:
@@ -212,7 +206,7 @@ def _write_mask(
     name: str,
     lookup: _Lookup,
 ) -> None:
-    mask = _load_mask(masks, image)
+    mask = _kept(masks, image)
     kept = mask if lookup is None else resampled(mask, lookup, nearest=True)
     names = (PurePosixPath(name).with_suffix(".png").name, f"{name}.png")
     for below, pixels in (
@@ -224,21 +218,12 @@ def _write_mask(
             (folder / below / mask_name).write_bytes(content)
 
 
-def _load_mask(masks: Path, image: TrainerImage) -> UInt8Array:
+def _kept(masks: Path, image: TrainerImage) -> UInt8Array:
     """(H, W) of the original image, 255 where it is kept."""
-    shape = (image.source.height, image.source.width)
-    path = find_mask(masks, image)
+    path = find_mask(masks, image.source.name)
     if path is None:
-        return np.full(shape, 255, np.uint8)
-    mask = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), cv2.IMREAD_GRAYSCALE)
-    if mask is None:
-        raise ImageError(f"{path}: no image that can be read; masks are PNG files, black where nothing is used")
-    if mask.shape != shape:
-        raise ImageError(
-            f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]} px and its image {shape[1]}x{shape[0]};"
-            " masks have the size of the original image"
-        )
-    return np.where(mask > 0, 255, 0).astype(np.uint8)
+        return np.full((image.source.height, image.source.width), 255, np.uint8)
+    return load_mask(path, image.source)
 
 
 def _smaller(pixels: UInt8Array, scale: int, how: int) -> UInt8Array:

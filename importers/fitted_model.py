@@ -21,9 +21,9 @@ import pycolmap
 from smust3r_colmap.errors import ConfigError, InputError
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.colmap_model import MIN_IMAGES, ForeignModel, SurfacePoints
-from smust3r_colmap.importers.image_folder import FolderScan, natural_key
+from smust3r_colmap.importers.image_folder import FolderScan, natural_key, shared_prior
 from smust3r_colmap.importers.images import Photo
-from smust3r_colmap.products import ImageCollection, RejectedImage, Scene, SourceImage
+from smust3r_colmap.products import ImageCollection, PointCloud, RejectedImage, Scene, SourceImage
 
 ASPECT_TOLERANCE = 0.05
 """Relative difference of width / height up to which a camera is that of the image, resized. Networks round sides to
@@ -45,9 +45,10 @@ class FittedModel:
     """A foreign model whose images are files that can be read.
 
     Args:
-        collection: the images of the model, in natural order of their names; ``rejected`` are those without
-            pose or file. Cameras are start values at the size of the files.
-        cam_from_world: (N, 3, 4) rigid, one per image of the collection.
+        collection: the images of the model, in natural order of their names, and behind them those of the folder
+            that shall be placed; ``rejected`` are those without pose or file. Cameras are start values at the size
+            of the files.
+        cam_from_world: (N, 3, 4) rigid, of the first N images of the collection.
         surface: the model's points; images by their index in the collection.
         remarks: what was assumed or changed, one sentence each, with numbers.
     """
@@ -58,8 +59,21 @@ class FittedModel:
     remarks: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        if self.cam_from_world.shape != (len(self.collection), 3, 4):
+        n = len(self.cam_from_world)
+        if self.cam_from_world.shape != (n, 3, 4) or n > len(self.collection):
             raise ValueError(f"FittedModel: {len(self.collection)} images, poses {self.cam_from_world.shape}")
+
+    @property
+    def num_posed(self) -> int:
+        """Images that the model has; those behind them are to be placed."""
+        return len(self.cam_from_world)
+
+    @property
+    def untracked_points(self) -> PointCloud:
+        """Points that no two images are known to see: of most exports all, a dense cloud."""
+        untracked = np.ones(len(self.surface.cloud), np.bool_)
+        untracked[self.surface.point_of_observation] = False
+        return PointCloud(xyz=self.surface.cloud.xyz[untracked], rgb=self.surface.cloud.rgb[untracked])
 
     def seen_by_tracks(self) -> dict[int, npt.NDArray[np.float64]]:
         """(S, 3) world points by image index, of the images in whose tracks ``ENOUGH_SEEN`` points stand."""
@@ -75,7 +89,7 @@ class FittedModel:
 
         A foreign model never says what its unit is, so the scene is not metric.
         """
-        images = self.collection.images
+        images = self.collection.images[: self.num_posed]
         return Scene(
             image_indices=tuple(range(len(images))),
             image_names=tuple(image.name for image in images),
@@ -95,6 +109,7 @@ def fit_to_images(
     share_cameras: bool = True,
     camera_model: str = "",
     calibrated: bool = False,
+    complete: bool = False,
 ) -> FittedModel:
     """Find the file of every image, and the camera of every file.
 
@@ -106,6 +121,9 @@ def fit_to_images(
         camera_model: COLMAP's name of the model that all cameras shall have; empty keeps what each has, but turns
             pinholes into SIMPLE_RADIAL, since most of them are guesses and photographs are distorted.
         calibrated: the cameras are known; they are brought to the size of the files and otherwise stay.
+        complete: files that the model has no image of join the collection, without a pose. Each has the camera of
+            files like it; where there are none, a camera of its own that starts from EXIF or COLMAP's guess, unless
+            the cameras are known: then it is left out.
 
     Raises:
         InputError: a name fits several files, two images fit one file, fewer than two images have a file, or the
@@ -117,7 +135,7 @@ def fit_to_images(
             f"--camera-model {camera_model}: with --calibrated the cameras stay as they are; leave one out"
         )
     remarks = list(model.repairs)
-    matched, rejected = _match_files(model, scan, remarks)
+    matched, unused, rejected = _match_files(model, scan, remarks)
     order = sorted(matched, key=lambda position: natural_key(matched[position].name))
     files = [matched[position] for position in order]
     owners = [model.camera_ids[position] for position in order]
@@ -130,6 +148,15 @@ def fit_to_images(
     if share_cameras and not calibrated:
         keys = _shared_keys(keys, resized, files, remarks)
     cameras, camera_of = _one_per_key(keys, resized)
+    if not calibrated:
+        cameras = _remodelled(cameras, camera_model, remarks)
+    others = [*model.unposed, *rejected]
+    if complete:
+        owned = list(zip(files, camera_of, strict=True))
+        cameras, owned_by_others, without_camera = _cameras_of_others(unused, owned, cameras, camera_model, calibrated)
+        files, camera_of = [*files, *owned_by_others], (*camera_of, *owned_by_others.values())
+        others = [one for one in others if one.name not in {file.name for file in owned_by_others}] + without_camera
+    _remark_on_unused([] if complete else unused, remarks)
     images = tuple(
         SourceImage(
             name=file.name,
@@ -142,12 +169,7 @@ def fit_to_images(
         for file, camera in zip(files, camera_of, strict=True)
     )
     return FittedModel(
-        collection=ImageCollection(
-            images=images,
-            cameras=cameras if calibrated else _remodelled(cameras, camera_model, remarks),
-            rejected=(*model.unposed, *rejected),
-            calibrated=calibrated,
-        ),
+        collection=ImageCollection(images=images, cameras=cameras, rejected=tuple(others), calibrated=calibrated),
         cam_from_world=model.cam_from_world[order],
         surface=_renumbered(model.surface, order, len(model)),
         remarks=tuple(remarks),
@@ -199,8 +221,8 @@ _SPELLINGS: Mapping[str, Callable[[str], str]] = {
 
 def _match_files(
     model: ForeignModel, scan: FolderScan, remarks: list[str]
-) -> tuple[dict[int, _File], list[RejectedImage]]:
-    """The file of each image by its position in the model, and the images that have none that can be read."""
+) -> tuple[dict[int, _File], list[_File], list[RejectedImage]]:
+    """The file of each image by its position in the model, files of no image, and the images without a usable file."""
     reasons = {one.name: one.reason for one in scan.unreadable}
     reasons |= {record.name: record.reason for record in scan.records if record.photo is None}
     usable = {
@@ -224,9 +246,13 @@ def _match_files(
             f"{MIN_IMAGES}; the model names {_few(model.names)}, the folder has {_few([*usable, *reasons])}"
         )
     unused = sorted(usable.keys() - found.values(), key=natural_key)
+    return matched, [usable[name] for name in unused], rejected
+
+
+def _remark_on_unused(unused: Sequence[_File], remarks: list[str]) -> None:
     if unused:
-        remarks.append(f"{len(unused)} files of the folder are not in the model and stay out: {_few(unused)}")
-    return matched, rejected
+        names = _few(file.name for file in unused)
+        remarks.append(f"{len(unused)} files of the folder are not in the model and stay out (--complete): {names}")
 
 
 def _found_names(
@@ -341,6 +367,30 @@ def _one_per_key(
         for alike in members.values()
     )
     return tuple(typical), tuple(numbers[key] for key in keys)
+
+
+def _cameras_of_others(
+    others: Sequence[_File],
+    owned: Sequence[tuple[_File, int]],
+    cameras: tuple[Intrinsics, ...],
+    camera_model: str,
+    calibrated: bool,
+) -> tuple[tuple[Intrinsics, ...], dict[_File, int], list[RejectedImage]]:
+    """All cameras, the number of the camera of each further file, and the files that are left out for want of one."""
+    number_of: dict[Hashable, int] = {}
+    for source in dict.fromkeys(file.source for file, _ in owned):
+        number_of[source] = Counter(camera for file, camera in owned if file.source == source).most_common(1)[0][0]
+    grown, camera_of, rejected = list(cameras), dict[_File, int](), list[RejectedImage]()
+    for file in others:
+        if file.source not in number_of and calibrated:
+            rejected.append(RejectedImage(name=file.name, reason="no image of the model is of its size and camera"))
+            continue
+        if file.source not in number_of:
+            number_of[file.source] = len(grown)
+            alike = [other.photo for other in others if other.source == file.source]
+            grown.append(shared_prior(alike, camera_model or cameras[0].model))
+        camera_of[file] = number_of[file.source]
+    return tuple(grown), camera_of, rejected
 
 
 _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")

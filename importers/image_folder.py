@@ -305,7 +305,7 @@ def collection_from_scan(scan: FolderScan, config: ImportConfig) -> ImageCollect
     rejected = sorted([*left_out, *scan.unreadable], key=lambda image: natural_key(image.name))
     _check_enough(scan, usable, rejected)
     groups = _camera_groups(usable, config.camera_mode)
-    cameras = [_shared_prior([usable[index].photo for index in members], config.camera_model) for members in groups]
+    cameras = [shared_prior([usable[index].photo for index in members], config.camera_model) for members in groups]
     if config.camera_params:
         cameras = _known_cameras(cameras, config)
     camera_of = {index: camera for camera, members in enumerate(groups) for index in members}
@@ -405,7 +405,7 @@ def _check_one_size(images: Sequence[_Usable], mode: CameraMode) -> None:
     )
 
 
-def _shared_prior(photos: Sequence[Photo], camera_model: str) -> Intrinsics:
+def shared_prior(photos: Sequence[Photo], camera_model: str) -> Intrinsics:
     """One camera for photos of one size: the median of the focal lengths EXIF gives, else COLMAP's guess."""
     width, height = photos[0].width, photos[0].height
     priors = [prior for photo in photos if (prior := focal_prior_px(photo.tags, width, height)) is not None]

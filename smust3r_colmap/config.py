@@ -39,6 +39,9 @@ class ImportConfig:
     camera_params: str = ""
     """Known intrinsics of all images: COLMAP's parameters of the camera model, separated by commas, in pixels of
     the upright images. They are used and kept as they are."""
+    masks: str = ""
+    """Folder of masks, IMAGE.png after the name of the image or STEM.png without its suffix, as large as the upright
+    image. Where they are black there are no features and no depth, and trainers get them."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -50,7 +50,7 @@ class Export:
     trainer_scales: str = ""
     """trainer: smaller copies of the images, such as 2,4,8 for images_2, images_4 and images_8."""
     masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """trainer: masks named IMAGE.png after the image, or by its stem; black is ignored."""
+    """trainer: masks named IMAGE.png after the image, or by its stem; black is ignored. By default those of the run."""
     keep_outliers: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """trainer: keep cameras and points that lie far from all others."""
     mesh: Literal["poisson", "tsdf"] = "poisson"

@@ -39,7 +39,7 @@ class FormatSettings:
     Args:
         text: models as .txt, too.
         trainer_scales: smaller copies of the trainer's images.
-        masks: a folder of masks for the trainer, or None.
+        masks: a folder of masks for the trainer; None takes those of the run, if it had any.
         keep_outliers: the trainer gets cameras and points far from all others, too.
         mesh: how the mesh is made.
     """
@@ -180,7 +180,7 @@ def write_trainer(finished: FinishedRun, settings: FormatSettings) -> Written:
         maps=finished.maps,
         cloud=finished.scenes[0].points,
         scales=settings.trainer_scales,
-        masks=settings.masks,
+        masks=settings.masks or finished.masks,
         keep_outliers=settings.keep_outliers,
     )
     left_out = report.left_out

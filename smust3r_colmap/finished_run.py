@@ -35,6 +35,7 @@ class FinishedRun:
         models: one per scene, folder of the COLMAP model with tracks, or None where there are none.
         database: that goes with the models, or None.
         maps: depth of the images, or None.
+        masks: folder of the masks that the run was made with, or None.
     """
 
     output: Path
@@ -44,6 +45,7 @@ class FinishedRun:
     models: tuple[Path | None, ...]
     database: Path | None
     maps: DepthMaps | None
+    masks: Path | None = None
 
     def sparse_model(self, number: int) -> Path:
         """Where the COLMAP model number ``number`` goes."""
@@ -56,6 +58,7 @@ def write_finished(run: RunDirectory, finished: FinishedRun) -> None:
         "images": str(finished.images.resolve()),
         "with_tracks": [model is not None for model in finished.models],
         "with_maps": finished.maps is not None,
+        "masks": None if finished.masks is None else str(finished.masks.resolve()),
     }
     write_json(run.work / FINISHED_FILE, facts)
 
@@ -99,6 +102,7 @@ def open_finished(run: RunDirectory, *, images: Path | None = None, output: Path
         raise RunDirectoryError(
             f"{run.work / FINISHED_FILE}: was written by another version; start the same reconstruct command again"
         ) from error
+    masks = facts.get("masks")
     refined = run.work / REFINED_STAGE
     return FinishedRun(
         output=run.root if output is None else output,
@@ -108,6 +112,7 @@ def open_finished(run: RunDirectory, *, images: Path | None = None, output: Path
         models=tuple(refined / str(k) / MODEL_FOLDER if has else None for k, has in enumerate(with_tracks)),
         database=refined / DATABASE_FILE if any(with_tracks) else None,
         maps=StoredDepthMaps(run.work / STITCHED_STAGE) if with_maps else None,
+        masks=None if masks is None else Path(masks),
     )
 
 

@@ -25,7 +25,7 @@ import pycolmap
 
 from smust3r_colmap import fusion
 from smust3r_colmap.alignment.edges import Edges, align_pieces, candidate_pairs, needs_maps
-from smust3r_colmap.backbones.base import Backbone, BackboneContext, BackboneResult
+from smust3r_colmap.backbones.base import Backbone, BackboneContext, BackboneFactory, BackboneResult
 from smust3r_colmap.backbones.registry import make_backbone, read_options
 from smust3r_colmap.chaining import ChainedPart
 from smust3r_colmap.config import RunConfig
@@ -47,7 +47,9 @@ from smust3r_colmap.importers.image_folder import (
     check_output_not_inside,
     collection_from_scan,
 )
+from smust3r_colmap.importers.masks import names_without_mask, with_masks
 from smust3r_colmap.loops.planning import LoopPlan, plan_loops
+from smust3r_colmap.masked_maps import without_masked_depth
 from smust3r_colmap.model_depth import depth_scales
 from smust3r_colmap.products import (
     EMPTY_CLOUD,
@@ -88,7 +90,13 @@ NOT_LOOKED_FOR = LoopPlan(threshold=None, weak_threshold=None, neighbours=0, sta
 
 
 def reconstruct(
-    images: Path, output: Path, config: RunConfig, *, fresh: bool = False, reporter: Reporter
+    images: Path,
+    output: Path,
+    config: RunConfig,
+    *,
+    fresh: bool = False,
+    reporter: Reporter,
+    factory: BackboneFactory = make_backbone,
 ) -> RunSummary:
     """From a folder of images to COLMAP models in ``output/sparse``.
 
@@ -97,6 +105,7 @@ def reconstruct(
         output: made when missing; what an earlier run finished there is used.
         fresh: start over instead.
         reporter: told about every stage.
+        factory: makes the backbone; by default the one that the configuration names.
 
     Raises:
         InputError: the images or the settings cannot be used.
@@ -111,10 +120,11 @@ def reconstruct(
         windows = plan_windows(
             len(collection), segment_length=config.segmentation.segment_length, overlap=config.segmentation.overlap
         )
-        backbone = _backbone(collection, config, run, clock)
+        backbone = _backbone(factory, collection, config, run, clock)
         plan = _find_loops(backbone, windows, config, run, clock)
         segments = (*windows, *(loop.segment for loop in plan.loops))
         result = backbone.reconstruct(segments, with_maps=_segments_with_maps(backbone, segments, config))
+        result = without_masked_depth(result, collection)
         _refuse_nothing(result, collection)
         edges = _align(result, segments, config, run, clock)
         stitching = _stitch(result, edges, plan, config, run, clock)
@@ -137,14 +147,27 @@ def _import(images: Path, config: RunConfig, run: RunDirectory, clock: StageCloc
         collection = collection_from_scan(scan, config.importing)
         if config.output.text:
             refuse_names_text_cannot_hold(image.name for image in collection.images)
+        collection = masked_as_wanted(collection, config.importing.masks, clock)
         stage.advance()
     for rejected in collection.rejected:
         clock.warn(f"left out: {rejected.name} ({rejected.reason})")
     return collection
 
 
-def _backbone(collection: ImageCollection, config: RunConfig, run: RunDirectory, clock: StageClock) -> Backbone:
-    backbone = make_backbone(
+def masked_as_wanted(collection: ImageCollection, masks: str, reporter: Reporter) -> ImageCollection:
+    """With the masks of the folder ``masks``, where one is named; also for a model from elsewhere."""
+    if not masks:
+        return collection
+    masked = with_masks(collection, Path(masks))
+    if whole := names_without_mask(masked.images):
+        reporter.warn(f"{len(whole)} of {len(masked)} images have no mask and are used as a whole, such as {whole[0]}")
+    return masked
+
+
+def _backbone(
+    factory: BackboneFactory, collection: ImageCollection, config: RunConfig, run: RunDirectory, clock: StageClock
+) -> Backbone:
+    backbone = factory(
         BackboneContext(
             collection=collection,
             config=config,
@@ -479,6 +502,7 @@ def _export(
         models=(None,) * len(scenes) if refinement is None else refinement.models,
         database=None if refinement is None or not any(refinement.models) else refinement.database,
         maps=stitched.maps,
+        masks=Path(config.importing.masks) if config.importing.masks else None,
     )
     with clock.stage("export", total=1) as stage:
         settings = FormatSettings.of(config.output)
@@ -585,6 +609,7 @@ def refinement_summaries(
             num_refused_pairs=one.num_refused_pairs,
             weak=tuple(collection.images[i].name for i in one.weak),
             registered=tuple(collection.images[i].name for i in one.registered),
+            principal_point=one.principal_point,
             steps=tuple(
                 RefinementStep(
                     name=step.name,

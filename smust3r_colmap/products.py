@@ -24,6 +24,19 @@ IntArray = npt.NDArray[np.int64]
 
 # ----------------------------------------------------------------------------- import
 @dataclass(frozen=True, kw_only=True)
+class ImageMask:
+    """A file of the size of an image, black where the image is not to be used.
+
+    Args:
+        path: where the file lies.
+        digest: hash of its content, part of the keys of the stages that look at it.
+    """
+
+    path: Path
+    digest: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class SourceImage:
     """One usable image.
 
@@ -34,6 +47,7 @@ class SourceImage:
         camera: index into ``ImageCollection.cameras``.
         digest: hash of the file's content, part of every key of a stage.
         timestamp_s: capture time, where the source has one.
+        mask: what of it is to be used; None for all.
     """
 
     name: str
@@ -43,6 +57,7 @@ class SourceImage:
     camera: int
     digest: str
     timestamp_s: float | None = None
+    mask: ImageMask | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +101,12 @@ class ImageCollection:
 
     def __len__(self) -> int:
         return len(self.images)
+
+    @property
+    def mask_digests(self) -> tuple[str, ...]:
+        """One per image, an empty one where it has no mask; none at all where no image has one."""
+        digests = tuple("" if image.mask is None else image.mask.digest for image in self.images)
+        return digests if any(digests) else ()
 
 
 # ----------------------------------------------------------------------- segmentation

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import tyro
 
-from smust3r_colmap.config import ClassicalConfig, OutputConfig, RefinementConfig, RunConfig
+from smust3r_colmap.config import ClassicalConfig, ImportConfig, OutputConfig, RefinementConfig, RunConfig
 from smust3r_colmap.errors import ConfigError
 from smust3r_colmap.progress import Reporter
 from smust3r_colmap.summary import RunSummary
@@ -47,6 +47,12 @@ class Refine:
     that are 3 degrees and 3 % of the extent off; smaller where the scene has places that look alike."""
     track_neighbours: int = RefinementConfig.track_neighbours
     """Images that each image is matched with, chosen by how much of the same surface they see."""
+    complete: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Also try to place the images of IMAGES that the model lacks: by the points they share with it, then by COLMAP's
+    incremental mapper."""
+    masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Folder of masks, IMAGE.png after the name of the image or STEM.png without its suffix, as large as the upright
+    image. Where they are black there are no features, and trainers get them."""
     max_image_size: int = ClassicalConfig.max_image_size
     """Longer side at which SIFT runs."""
     max_features: int = ClassicalConfig.max_features
@@ -75,8 +81,9 @@ class Refine:
     def run_config(self) -> RunConfig:
         """The settings of the run that the flags stand for; without depth maps there is no dense workspace."""
         return RunConfig(
+            importing=ImportConfig(masks="" if self.masks is None else str(self.masks)),
             classical=ClassicalConfig(max_image_size=self.max_image_size, max_features=self.max_features),
-            refinement=RefinementConfig(track_neighbours=self.track_neighbours),
+            refinement=RefinementConfig(track_neighbours=self.track_neighbours, complete=self.complete),
             output=OutputConfig(text=self.text, trainer=self.trainer, dense=False),
             workers=self.workers,
             seed=self.seed,

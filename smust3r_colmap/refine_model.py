@@ -2,8 +2,9 @@
 
     read      anybody's files, repaired                     importers.colmap_model
     fit       to the image files, at their size             importers.fitted_model
-    match     neighbours, where no points say who sees what
+    match     neighbours, where no points say who sees what; images to be placed, with those that look like them
     refine    as in a run of ours                           refinement.refine
+    carry     the points without tracks, to the adjusted cameras
     export    as in a run of ours                           exports
 
 Exports of feed-forward networks have poses that are nearly right, cameras at the size of the network and no
@@ -16,25 +17,28 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pycolmap
 
+from smust3r_colmap.alignment.from_poses import align_poses
 from smust3r_colmap.backbones.classical.features import match_pairs
-from smust3r_colmap.backbones.classical.run_features import features_of_run
+from smust3r_colmap.backbones.classical.run_features import describe_images, features_of_run
 from smust3r_colmap.config import RunConfig
 from smust3r_colmap.config_file import config_to_toml
-from smust3r_colmap.errors import ConfigError
+from smust3r_colmap.errors import ConfigError, DegenerateAlignmentError
 from smust3r_colmap.execution import usable_cores
 from smust3r_colmap.exporters.aside import replace_file
 from smust3r_colmap.exporters.colmap_sparse import MODEL_FILES, refuse_names_text_cannot_hold
 from smust3r_colmap.exporters.tum_trajectory import write_tum
 from smust3r_colmap.exports import FORMATS, FormatSettings, Outputs, write_where_possible
 from smust3r_colmap.finished_run import FinishedRun, forget_finished, write_finished
-from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
+from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.importers.colmap_model import ForeignModel, read_colmap_model
 from smust3r_colmap.importers.fitted_model import FittedModel, fit_to_images
 from smust3r_colmap.importers.image_folder import check_output_not_inside
-from smust3r_colmap.pipeline import refinement_summaries
-from smust3r_colmap.products import FloatArray, PointCloud, RunFeatures, Scene
+from smust3r_colmap.pipeline import masked_as_wanted, refinement_summaries
+from smust3r_colmap.products import FloatArray, PointCloud, RunFeatures, Scene, SegmentPiece
 from smust3r_colmap.progress import Reporter
 from smust3r_colmap.refinement.correspondences import Pair
 from smust3r_colmap.refinement.refine import Refinement, refine, surfaces_of_clouds
@@ -75,8 +79,9 @@ def refine_model(
         model: folder of the model; it is only read.
         images: folder of its images.
         output: made when missing; what an earlier start finished there is used.
-        config: ``classical`` (features), ``refinement``, ``output``, ``segmentation`` (parts of large models),
-            ``workers`` and ``seed`` are used.
+        config: ``importing.masks``, ``classical`` (features), ``refinement`` (with ``complete`` also images of the
+            folder that the model lacks are placed), ``output``, ``segmentation`` (parts of large models), ``workers``
+            and ``seed`` are used.
         cameras: what is to become of the cameras.
         pose_tolerance: how far from its epipolar line a match may lie at first, as a part of the longer image side.
         fresh: start over.
@@ -97,7 +102,7 @@ def refine_model(
         features = _features(fitted, start, config, run, clock)
         refinement = _refine(fitted, start, features, config, run, clock, tolerance=pose_tolerance)
         _doubt_the_poses(refinement, clock)
-        result = _with_points(start, refinement)
+        result = _with_points(fitted, start, refinement)
         outputs = _export(result, start, refinement, images, config, run, clock)
         summary = _summarise(fitted, result, refinement, outputs, run, clock)
         write_json(run.root / "summary.json", {**summary.to_json_dict(), "model_remarks": fitted.remarks})
@@ -117,10 +122,16 @@ def _fit(
     with clock.stage("import", total=1) as stage:
         scan = scan_changed_files(images, run, workers=config.workers)
         fitted = fit_to_images(
-            foreign, scan, share_cameras=cameras.share, camera_model=cameras.model, calibrated=cameras.calibrated
+            foreign,
+            scan,
+            share_cameras=cameras.share,
+            camera_model=cameras.model,
+            calibrated=cameras.calibrated,
+            complete=config.refinement.complete,
         )
         if config.output.text:
             refuse_names_text_cannot_hold(image.name for image in fitted.collection.images)
+        fitted = replace(fitted, collection=masked_as_wanted(fitted.collection, config.importing.masks, clock))
         stage.advance()
     for remark in fitted.remarks:
         clock.note(remark)
@@ -133,20 +144,42 @@ def _fit(
 def _features(
     fitted: FittedModel, start: Scene, config: RunConfig, run: RunDirectory, clock: StageClock
 ) -> RunFeatures:
-    """SIFT of all images; without points also the matches of neighbours, for there is no surface to choose pairs by."""
+    """SIFT of all images, and the matches that no surface chooses: of neighbours in a model without points, and of
+    images that have no pose yet."""
     workers = config.workers or usable_cores()
     features = features_of_run(fitted.collection, config.classical, run, clock, workers=workers, seed=config.seed)
-    if len(start.points):
-        return features
-    pairs = neighbouring_pairs(
-        start.cam_from_world,
-        per_image=config.refinement.track_neighbours,
-        exhaustive_below=config.classical.exhaustive_below,
-    )
-    usable = [pair for pair in pairs if features.usable[pair[0]] and features.usable[pair[1]]]
-    with clock.stage("matching", total=len(usable)) as stage:
-        match_pairs(features.database, usable, workers=workers, seed=config.seed, log_file=run.native_log, stage=stage)
+    per_image, exhaustive_below = config.refinement.track_neighbours, config.classical.exhaustive_below
+    pairs: set[Pair] = set()
+    if not len(start.points):
+        pairs |= set(neighbouring_pairs(start.cam_from_world, per_image=per_image, exhaustive_below=exhaustive_below))
+    if fitted.num_posed < len(fitted.collection):
+        descriptors = describe_images(features, run, seed=config.seed)
+        pairs |= set(alike_pairs(descriptors, fitted.num_posed, per_image=per_image, exhaustive_below=exhaustive_below))
+    usable = sorted((a, b) for a, b in pairs if features.usable[a] and features.usable[b])
+    if usable:
+        with clock.stage("matching", total=len(usable)) as stage:
+            match_pairs(
+                features.database, usable, workers=workers, seed=config.seed, log_file=run.native_log, stage=stage
+            )
     return features
+
+
+def alike_pairs(
+    descriptors: npt.NDArray[np.float32], num_posed: int, *, per_image: int, exhaustive_below: int
+) -> tuple[Pair, ...]:
+    """Pairs (i < j) of each image that is to be placed with those most like it; of few images, with all.
+
+    Args:
+        descriptors: (N, D) unit vectors. num_posed: images from this one on are to be placed.
+        per_image: most similar others of each, with and without a pose.
+        exhaustive_below: up to so many images every pair is taken.
+    """
+    n = len(descriptors)
+    wanted = n - 1 if n <= exhaustive_below else min(per_image, n - 1)
+    similarity = descriptors[num_posed:] @ descriptors.T
+    similarity[np.arange(n - num_posed), np.arange(num_posed, n)] = -np.inf
+    most_alike = np.argsort(-similarity, axis=1, kind="stable")[:, :wanted]
+    return tuple(sorted({(min(i, j), max(i, j)) for i, row in enumerate(most_alike.tolist(), num_posed) for j in row}))
 
 
 def neighbouring_pairs(cam_from_world: FloatArray, *, per_image: int, exhaustive_below: int) -> tuple[Pair, ...]:
@@ -212,17 +245,55 @@ def _doubt_the_poses(refinement: Refinement, clock: StageClock) -> None:
 
 
 # ---------------------------------------------------------------------------- results
-def _with_points(start: Scene, refinement: Refinement) -> Scene:
-    """The refined scene with its tracked points; the given cloud hangs on cameras that have moved since."""
+def _with_points(fitted: FittedModel, start: Scene, refinement: Refinement) -> Scene:
+    """The refined scene with its tracked points, and behind them the given ones that have no track."""
     (folder,) = refinement.models
     if folder is None:
         return start
-    points = pycolmap.Reconstruction(folder).points3D.values()
+    scene = refinement.scenes[0]
+    model = pycolmap.Reconstruction(folder)
+    tracked, untracked = list(model.points3D.values()), fitted.untracked_points
+    moved = refined_from_start(start, scene, _median_depth(model)).apply(untracked.xyz)
     cloud = PointCloud(
-        xyz=np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
-        rgb=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+        xyz=np.concatenate([np.reshape([point.xyz for point in tracked], (-1, 3)), moved]),
+        rgb=np.concatenate([np.reshape([point.color for point in tracked], (-1, 3)).astype(np.uint8), untracked.rgb]),
     )
-    return replace(refinement.scenes[0], points=cloud)
+    return replace(scene, points=cloud)
+
+
+def refined_from_start(start: Scene, refined: Scene, depth: float) -> Transform:
+    """How the cameras have moved as a whole, which takes along what hangs on no camera in particular.
+
+    One similarity for all points. To move each with the cameras that may see it would need to know which do: by
+    projection alone, walls between them unknown, the points of castle_p30 came to lie a third farther from the tracks.
+
+    Args:
+        start, refined: the first has no image that the second lacks.
+        depth: usual depth of the scene in the world of ``refined``.
+    """
+    try:
+        return align_poses(_cameras_as_piece(refined), _cameras_as_piece(start), depth_target=depth).estimate.b_from_a
+    except DegenerateAlignmentError:  # the camera only turned: the priors have kept the world where it was
+        return Sim3.identity()
+
+
+def _cameras_as_piece(scene: Scene) -> SegmentPiece:
+    return SegmentPiece(
+        segment=0,
+        piece=0,
+        images=scene.image_indices,
+        seg_from_cam=invert_rigid(scene.cam_from_world),
+        intrinsics=tuple(scene.cameras[camera] for camera in scene.camera_indices),
+        method="refinement",
+        reprojection_error_px=np.nan,
+        tracks=None,
+    )
+
+
+def _median_depth(model: pycolmap.Reconstruction) -> float:
+    """Of the points, each in the first image of its track."""
+    first = [(model.image(point.track.elements[0].image_id), point.xyz) for point in model.points3D.values()]
+    return float(np.median([(image.cam_from_world() * xyz)[2] for image, xyz in first]))
 
 
 def _export(
@@ -247,6 +318,7 @@ def _export(
         models=refinement.models,
         database=refinement.database if has_tracks else None,
         maps=None,
+        masks=Path(config.importing.masks) if config.importing.masks else None,
     )
     settings = FormatSettings.of(config.output)
     with clock.stage("export", total=1) as stage:
@@ -283,7 +355,11 @@ def _summarise(
             ),
         ),
         rejected=tuple(ImageRemark(name=one.name, reason=one.reason) for one in fitted.collection.rejected),
-        unregistered=(),
+        unregistered=tuple(
+            ImageRemark(name=image.name, reason="no place was found that its matches agree with")
+            for index, image in enumerate(fitted.collection.images)
+            if index not in result.image_indices
+        ),
         stages=tuple(clock.stages),
         segments=(),
         edges=(),
@@ -302,5 +378,15 @@ def _summarise(
         peak_memory_bytes=peak_memory_bytes(),
         refinements=refinement_summaries(refinement, fitted.collection, run),
         missing_outputs=outputs.missing,
-        remarks=outputs.remarks,
+        remarks=(*_remarks_on_points(fitted, refinement), *outputs.remarks),
+    )
+
+
+def _remarks_on_points(fitted: FittedModel, refinement: Refinement) -> tuple[str, ...]:
+    untracked = len(fitted.untracked_points)
+    if not untracked or not any(refinement.models):
+        return ()
+    return (
+        f"points.ply: {untracked} points of the given model have no track; they were moved with the cameras as a whole "
+        "and are not in sparse/0",
     )

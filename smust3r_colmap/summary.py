@@ -202,6 +202,7 @@ class RefinementSummary:
         num_refused_pairs: verified pairs that contradict the stitched geometry, such as look-alike places.
         weak: images with fewer than 15 observations, which keep their stitched place.
         registered: images that had no pose before.
+        principal_point: whether it was freed, and why not, in words; empty where that was never asked.
         steps: in order.
     """
 
@@ -217,6 +218,7 @@ class RefinementSummary:
     num_refused_pairs: int
     weak: tuple[str, ...]
     registered: tuple[str, ...]
+    principal_point: str
     steps: tuple[RefinementStep, ...]
 
 
@@ -373,6 +375,8 @@ def _refinement_lines(one: RefinementSummary) -> list[str]:
         f"  {one.folder}: {one.num_observations} observations of {one.num_points} points "
         f"(track length {one.mean_track_length:.2f}), reprojection error {one.reprojection_error_px:.2f} px"
     ]
+    if one.principal_point:
+        lines.append(f"  {one.folder}: principal point {one.principal_point}")
     lines += [f"  {one.folder}: {step.name} undone, {step.reason}" for step in one.steps if not step.kept]
     for what, names in (("few observations", one.weak), ("placed by the refinement", one.registered)):
         if names:

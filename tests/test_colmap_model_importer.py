@@ -418,6 +418,42 @@ def test_files_that_the_model_lacks_are_told() -> None:
     )
 
 
+def test_files_that_the_model_lacks_come_behind_its_images_with_the_camera_of_their_like() -> None:
+    model = foreign(["b.jpg", "c.jpg"], [intrinsics()], [0, 0])
+    small = scanned("tele.jpg", size=(100, 80)).records
+    scan = scanned("a.jpg", "b.jpg", "c.jpg")
+    fitted = fit_to_images(model, replace(scan, records=(*scan.records, *small)), complete=True, camera_model="RADIAL")
+    assert names_of(fitted) == ["b.jpg", "c.jpg", "a.jpg", "tele.jpg"]
+    assert [image.camera for image in fitted.collection.images] == [0, 0, 0, 1]
+    guess = fitted.collection.cameras[1]
+    assert (guess.model, guess.width, guess.height, guess.focal_px) == ("RADIAL", 100, 80, 120)
+    assert fitted.num_posed == len(fitted.scene("given")) == 2
+    assert not any("stay out" in remark for remark in fitted.remarks)
+
+
+def test_no_camera_is_guessed_where_all_are_known() -> None:
+    small = scanned("tele.jpg", size=(100, 80)).records
+    scan = replace(scanned("a.jpg", "b.jpg", "c.jpg"), records=(*scanned("a.jpg", "b.jpg", "c.jpg").records, *small))
+    fitted = fit_to_images(foreign(["b.jpg", "c.jpg"], [intrinsics()], [0, 0]), scan, complete=True, calibrated=True)
+    assert names_of(fitted) == ["b.jpg", "c.jpg", "a.jpg"]
+    (left_out,) = fitted.collection.rejected
+    assert (left_out.name, left_out.reason) == ("tele.jpg", "no image of the model is of its size and camera")
+
+
+def test_an_image_without_a_pose_in_the_model_is_placed_like_one_that_it_lacks() -> None:
+    nameless = RejectedImage(name="a.jpg", reason="its pose in the model is not finite")
+    model = replace(foreign(["b.jpg", "c.jpg"], [intrinsics()], [0, 0]), unposed=(nameless,))
+    fitted = fit_to_images(model, scanned("a.jpg", "b.jpg", "c.jpg"), complete=True)
+    assert names_of(fitted) == ["b.jpg", "c.jpg", "a.jpg"]
+    assert fitted.collection.rejected == ()
+
+
+def test_points_without_tracks_are_told_from_the_others(tmp_path: Path) -> None:
+    fitted = fit_to_images(read_colmap_model(Text().write(tmp_path)), scanned("a.jpg", "b.jpg", "c.jpg"))
+    assert fitted.untracked_points.xyz.tolist() == [[1, 2, 7]]
+    assert fitted.untracked_points.rgb.tolist() == [[0, 255, 0]]
+
+
 def test_a_folder_of_other_images_is_refused_with_examples_of_both() -> None:
     with pytest.raises(InputError, match=r"files for 1 of 2 images of export, needed are 2; .*'b.jpg'.*'x.jpg'"):
         fit_to_images(foreign(["a.jpg", "b.jpg"], [intrinsics()], [0, 0]), scanned("a.jpg", "x.jpg"))

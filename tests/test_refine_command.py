@@ -21,11 +21,13 @@ from smust3r_colmap.demo import DemoScene, demo_intrinsics
 from smust3r_colmap.errors import ConfigError, InputError
 from smust3r_colmap.evaluation import Evaluation, compare_trajectories, read_reference_sparse
 from smust3r_colmap.geometry.camera import pointmap_from_depth
-from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
+from smust3r_colmap.products import EMPTY_CLOUD, Scene
 from smust3r_colmap.progress import QuietReporter
 from smust3r_colmap.refine_command import Refine, run_refine
-from smust3r_colmap.refine_model import neighbouring_pairs
+from smust3r_colmap.refine_model import alike_pairs, neighbouring_pairs, refined_from_start
 from smust3r_colmap.summary import RunSummary
+from smust3r_colmap.validation.surroundings import read_ply
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -33,6 +35,10 @@ NUM_IMAGES = 8
 CAMERA = demo_intrinsics(320, 240)
 NETWORK_SIZE = (518, 392)
 """518 wide, and the height rounded to a multiple of 14 from 388.5."""
+
+
+LACKING = ("003.png", "006.png")
+"""Images that a model may lack."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +143,8 @@ def test_tracks_are_real_and_the_summary_counts_them(result: RunSummary) -> None
     (figures,) = json.loads((result.output / "summary.json").read_text())["refinements"]
     assert figures["num_points"] == model.num_points3D() > 100
     assert figures["steps"][0]["name"] == "triangulation"
+    assert "principal point kept" in result.render_text() or "principal point free" in result.render_text()
+    assert figures["principal_point"] in result.render_text()
     adjustments = [step for step in figures["steps"] if "adjustment" in step["name"]]
     assert adjustments[0]["error_after_px"] < adjustments[0]["error_before_px"]
 
@@ -162,6 +170,40 @@ def test_the_files_are_those_of_a_reconstruction(result: RunSummary) -> None:
     names = {path.name for path in result.output.iterdir()}
     assert names >= {"points.ply", "scene.glb", "trajectory_tum.txt", "trajectory_stitched_tum.txt", "config.toml"}
     assert not names & {"trainer", "dense"}
+
+
+def test_the_given_cloud_comes_along_with_the_cameras(export: Export, result: RunSummary) -> None:
+    """Its points are those of the true surface, so they must lie there again, seen from the refined cameras."""
+    cloud = read_ply(result.output / "points.ply").xyz
+    (figures,) = result.refinements
+    given = np.array([line.split()[1:4] for line in (export.model / "points3D.txt").read_text().splitlines()], float)
+    assert len(cloud) == figures.num_points + len(given) == result.models[0].num_points
+    truth_from_result = export.error_of(result.output / "sparse/0").reference_from_estimated
+    off = np.linalg.norm(truth_from_result.apply(cloud[figures.num_points :]) - given, axis=1)
+    assert np.linalg.norm(cloud[figures.num_points :] - given, axis=1).min() > 1e-4
+    assert 0 < np.median(off) < 0.03
+    assert f"{len(given)} points of the given model have no track" in result.render_text()
+
+
+def test_images_that_the_model_lacks_are_placed_when_that_is_wanted(export: Export, tmp_path: Path) -> None:
+    shutil.copytree(export.model, tmp_path / "export")
+    lines = (tmp_path / "export/images.txt").read_text().splitlines(keepends=True)
+    (tmp_path / "export/images.txt").write_text("".join(line for line in lines if line.split()[9] not in LACKING))
+    shutil.copytree(export.images, tmp_path / "photos")
+    Image.new("RGB", (320, 240), (128, 128, 128)).save(tmp_path / "photos/grey.png")
+    wanted = replace(
+        command(export, tmp_path / "out"), model=tmp_path / "export", images=tmp_path / "photos", complete=True
+    )
+    summary = refined(wanted)
+    assert (summary.num_images, summary.num_registered) == (NUM_IMAGES + 1, NUM_IMAGES)
+    assert summary.refinements[0].registered == LACKING
+    assert [one.name for one in summary.unregistered] == ["grey.png"]
+    model = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
+    assert model.num_cameras() == 1
+    assert [model.image(i).name for i in sorted(model.images)][-2:] == list(LACKING)
+    found = compare_trajectories(read_reference_sparse(tmp_path / "out/sparse/0"), export.truth)
+    assert found.num_compared == NUM_IMAGES
+    assert 0 < found.position_max < 0.03
 
 
 def test_a_second_start_computes_nothing_and_writes_the_same(export: Export, result: RunSummary) -> None:
@@ -250,13 +292,53 @@ def test_a_tolerance_that_means_nothing_is_refused(tolerance: float) -> None:
 
 def test_flags_reach_the_settings_of_the_run() -> None:
     flags = "m --images i --output o --max-features 5 --track-neighbours 3 --text --trainer --workers 2 --seed 4"
+    flags += " --complete --masks somewhere"
     config = tyro.cli(Refine, args=flags.split()).run_config()
     assert (config.classical.max_features, config.refinement.track_neighbours) == (5, 3)
     assert (config.output.text, config.output.trainer, config.output.dense) == (True, True, False)
     assert (config.workers, config.seed) == (2, 4)
+    assert (config.refinement.complete, config.importing.masks) == (True, "somewhere")
+
+
+# ------------------------------------------------------------------------ the given cloud
+def test_points_follow_the_cameras_as_a_whole_and_stay_where_that_is_unknown() -> None:
+    rng = np.random.default_rng(0)
+    world_from_cam = DemoScene().camera_path(32)[:NUM_IMAGES]
+    start = scene_of(world_from_cam)
+    moved = Sim3(
+        scale=np.array(1.3), rotation=Rotation.from_rotvec((0.1, 0.4, 0)).as_matrix(), translation=np.array([1.0, 2, 3])
+    )
+    points = rng.normal(0, 3, (5, 3))
+    followed = refined_from_start(start, scene_of(moved.move_cameras(world_from_cam)), 4.0).apply(points)
+    assert np.allclose(followed, moved.apply(points), atol=1e-6)
+    turned = scene_of(np.tile(world_from_cam[:1], (3, 1, 1)))
+    assert np.array_equal(refined_from_start(turned, turned, 4.0).apply(points), points)
+
+
+def scene_of(world_from_cam: FloatArray) -> Scene:
+    indices = tuple(range(len(world_from_cam)))
+    return Scene(
+        image_indices=indices,
+        image_names=tuple(f"{k:03d}.png" for k in indices),
+        camera_indices=(0,) * len(indices),
+        cameras={0: CAMERA},
+        cam_from_world=invert_rigid(world_from_cam),
+        points=EMPTY_CLOUD,
+        metric=False,
+        segments=("0",),
+    )
 
 
 # ------------------------------------------------------------------- pairs without points
+def test_images_to_be_placed_are_paired_with_those_most_like_them() -> None:
+    turns = np.deg2rad([0, 10, 20, 90, 12, 88], dtype=np.float32)
+    descriptors = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    assert alike_pairs(descriptors, 4, per_image=2, exhaustive_below=5) == ((1, 4), (2, 4), (2, 5), (3, 5))
+    everything = alike_pairs(descriptors, 4, per_image=2, exhaustive_below=6)
+    assert everything == tuple((i, j) for i in range(6) for j in range(i + 1, 6) if j > 3)
+    assert alike_pairs(descriptors, 4, per_image=9, exhaustive_below=1) == everything
+
+
 def looking(directions_deg: Sequence[float], positions: Sequence[float]) -> FloatArray:
     """``cam_from_world`` (N, 3, 4) of cameras on the x axis that look away from z by an angle."""
     world_from_cam = np.zeros((len(positions), 3, 4))

@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from smust3r_colmap.errors import ConfigError, InputError, StorageError
-from smust3r_colmap.validation.description import CAMERA_MODELS, Defect, ImageFile, Rig, Subject
+from smust3r_colmap.validation.description import CAMERA_MODELS, Defect, FloatArray, ImageFile, Rig, Subject
 from smust3r_colmap.validation.layout import UnreadableModelError, find_layout
 from smust3r_colmap.validation.projection import index_of, project
 from smust3r_colmap.validation.readers import READERS, find_readers
@@ -29,6 +29,7 @@ from smust3r_colmap.validation.surroundings import (
     read_image_folder,
     read_ply,
 )
+from smust3r_colmap.validation.transforms_file import read_transforms
 from smust3r_colmap.validation.validate import describe, read_model, validate
 
 WIDTH, HEIGHT, NUM_IMAGES, NUM_POINTS = 256, 192, 6, 60
@@ -67,7 +68,23 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     params = {Path(name).stem: {"scale": 1.0 + number / 10, "offset": 0} for number, name in enumerate(names)}
     (sparse / "depth_params.json").write_text(json.dumps(params))
     write_ply(sparse / "points3D.ply", np.array([point.xyz for point in model.points3D.values()]))
+    shutil.copy(sparse / "points3D.ply", folder / "sparse_pc.ply")
+    (folder / "transforms.json").write_text(json.dumps(transforms_of(model)))
     return folder
+
+
+def transforms_of(model: pycolmap.Reconstruction) -> dict[str, Any]:
+    """With camera axes of OpenGL, in a world that is turned, scaled and moved."""
+    turned, frames = np.array([[0.0, 0, 2], [2, 0, 0], [0, 2, 0]]), []
+    for image in model.images.values():
+        world_from_cam = image.cam_from_world().inverse()
+        matrix = np.eye(4)
+        matrix[:3, :3] = turned / 2 @ world_from_cam.rotation.matrix() @ np.diag([1, -1, -1])
+        matrix[:3, 3] = turned @ world_from_cam.translation + (1, 2, 3)
+        mask = f"masks/{Path(image.name).stem}.png"
+        frames.append({"file_path": f"images/{image.name}", "mask_path": mask, "transform_matrix": matrix.tolist()})
+    intrinsics = {"w": WIDTH, "h": HEIGHT, "fl_x": 300.0, "fl_y": 300.0, "cx": WIDTH / 2, "cy": HEIGHT / 2}
+    return {"camera_model": "PINHOLE", **intrinsics, "ply_file_path": "sparse_pc.ply", "frames": frames}
 
 
 def write_image(path: Path, width: int, height: int, orientation: int = 1) -> None:
@@ -121,7 +138,7 @@ def found_in(subject: Subject) -> set[str]:
 
 
 def test_the_good_scene_has_everything_and_breaks_no_rule(good: Subject) -> None:
-    parts = (good.images, good.masks, good.database, good.ply, good.depth, good.dense)
+    parts = (good.images, good.masks, good.database, good.ply, good.depth, good.dense, good.transforms)
 
     assert all(part is not None for part in parts)
     assert set(good.downscaled) == {2}
@@ -545,7 +562,57 @@ FROM_BARE: dict[str, Case] = {
     },
 }
 
+
+def with_first_frame(**changes: Any) -> Edit:
+    def edit(good: Subject) -> Subject:
+        assert good.transforms is not None
+        first, *others = good.transforms.frames
+        return part("transforms", frames=(replace(first, **changes), *others))(good)
+
+    return edit
+
+
+def with_first_matrix(change: Callable[[FloatArray], FloatArray]) -> Edit:
+    def edit(good: Subject) -> Subject:
+        assert good.transforms is not None
+        matrix = change(good.transforms.frames[0].world_from_opengl.copy())
+        return with_first_frame(world_from_opengl=matrix)(good)
+
+    return edit
+
+
+def moved(matrix: FloatArray) -> FloatArray:
+    return np.asarray(matrix + np.pad([[0.5]], ((0, 3), (3, 0))))
+
+
+def colmap_axes(good: Subject) -> Subject:
+    """Whoever forgets to turn the axes of the cameras."""
+    assert good.transforms is not None
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    frames = tuple(replace(f, world_from_opengl=f.world_from_opengl @ flip) for f in good.transforms.frames)
+    return part("transforms", frames=frames)(good)
+
+
 FROM_GOOD: dict[str, Case] = {
+    "transforms-unreadable": (part("transforms", problem="it has no list of frames", frames=()), set()),
+    "transforms-image-missing": (
+        lambda good: part("transforms", images={k: v for k, v in good.transforms.images.items() if k[0] != "i"})(good),  # type: ignore[union-attr]
+        set(),
+    ),
+    "transforms-masks-incomplete": (with_first_frame(mask_path=""), set()),
+    "transforms-points-missing": (part("transforms", ply_is_there=False), set()),
+    "transforms-camera-model": (part("transforms", camera_model="FOV"), set()),
+    "transforms-intrinsics": (with_first_frame(numbers={"w": WIDTH, "h": HEIGHT, "fl_x": 0.0}), set()),
+    "transforms-size-differs": (
+        with_first_frame(numbers={"w": 512.0, "h": HEIGHT, "fl_x": 1.0, "fl_y": 1.0, "cx": 0.0, "cy": 0.0}),
+        set(),
+    ),
+    "transforms-pose-not-rigid": (with_first_matrix(lambda matrix: matrix * 1.1), set()),
+    "transforms-images-differ": (
+        lambda good: part("transforms", frames=good.transforms.frames[1:])(good),  # type: ignore[union-attr]
+        set(),
+    ),
+    "transforms-cameras-differ": (with_first_matrix(moved), set()),
     "image-file-missing": (lambda good: with_files(good, lambda files: files[1:]), set()),
     "image-file-extra": (
         lambda good: with_files(good, lambda files: (*files, replace(files[0], name="zz.png"))),
@@ -614,6 +681,31 @@ def test_what_lies_beside_a_model_can_break_this_rule_alone(good: Subject, rule:
     edit, others = FROM_GOOD[rule]
 
     assert found_in(edit(good)) == expected(rule, others)
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (lambda matrix: matrix * np.array([[1, 1, 1, 1]] * 3 + [[2] * 4]), "the last row is 0 0 0 2"),
+        (lambda matrix: matrix @ np.diag([-1, 1, 1, 1]), "the axes are left-handed"),
+        (lambda matrix: matrix @ np.diag([1.01, 1, 1, 1]), "from orthonormal"),
+        (lambda matrix: matrix * NAN, "not 4 x 4 finite numbers"),
+    ],
+)
+def test_it_is_said_why_a_matrix_is_no_pose(
+    good: Subject, change: Callable[[FloatArray], FloatArray], what: str
+) -> None:
+    found = apply_rules(with_first_matrix(change)(good), RULES.values())
+
+    assert set(found) == ALWAYS | {"transforms-pose-not-rigid"}
+    assert what in found["transforms-pose-not-rigid"].text
+
+
+def test_axes_of_colmap_are_told_by_half_a_turn(good: Subject) -> None:
+    found = apply_rules(colmap_axes(good), RULES.values())
+
+    assert set(found) == ALWAYS | {"transforms-cameras-differ"}
+    assert "1.8e+02 degrees" in found["transforms-cameras-differ"].text
 
 
 @pytest.mark.parametrize("name", CAMERA_MODELS)
@@ -1001,6 +1093,34 @@ def test_depth_parameters_without_a_scale_are_unreadable(tmp_path: Path) -> None
     assert depth is not None
     assert "scale" in depth.problem
     assert read_depth(tmp_path / "none.json", tmp_path / "depths") is None
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        ("{", "Expecting property name"),
+        ("[]", "no list of frames"),
+        ('{"frames": [{"file_path": "a"}, {}]}', "frame 2 has no file_path"),
+    ],
+)
+def test_a_transforms_file_that_cannot_be_read_says_why(tmp_path: Path, content: str, problem: str) -> None:
+    (tmp_path / "transforms.json").write_text(content)
+
+    assert problem in read_transforms(tmp_path / "transforms.json").problem
+
+
+def test_a_frame_has_numbers_of_its_own_before_those_of_the_file(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.png", 40, 30)
+    frames = [{"file_path": "a.png", "w": 40, "fl_x": "wide"}, {"file_path": "b", "transform_matrix": [[1, 2], 3]}]
+    document = {"w": 80, "h": 30, "frames": frames, "ply_file_path": "nothing.ply"}
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    found = read_transforms(tmp_path / "transforms.json")
+
+    assert (found.frames[0].numbers["w"], found.frames[1].numbers["w"]) == (40, 80)
+    assert np.isnan(found.frames[0].numbers["fl_x"])
+    assert np.isnan(found.frames[1].world_from_opengl).all()
+    assert list(found.images) == ["a.png"]
+    assert not found.ply_is_there
 
 
 def test_a_depth_map_cut_short_has_no_size(tmp_path: Path) -> None:

@@ -395,6 +395,44 @@ class DenseFolder:
     fusion_names: tuple[str, ...] | None
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TransformsFrame:
+    """One frame of a transforms.json.
+
+    Args:
+        file_path, mask_path: as they stand there; no mask is empty.
+        numbers: ``w``, ``h``, ``fl_x`` and so on, those of the whole file where the frame has none of its own; NaN
+            where something else than a number stands.
+        world_from_opengl: (4, 4) camera to world, y up and z backward; NaN where it is no such matrix.
+    """
+
+    file_path: str
+    mask_path: str
+    numbers: Mapping[str, float]
+    world_from_opengl: FloatArray
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransformsFile:
+    """The transforms.json of a scene, for nerfstudio and instant-ngp.
+
+    Args:
+        camera_model: empty where none is named. ply_file_path: likewise.
+        frames: in the order of the file.
+        images: headers of the images and masks that it names and that are there, by path as it stands.
+        ply_is_there: the file of points exists.
+        problem: why it could not be read; empty when it could.
+    """
+
+    path: Path
+    camera_model: str
+    ply_file_path: str
+    frames: tuple[TransformsFrame, ...]
+    images: Mapping[str, ImageFile]
+    ply_is_there: bool
+    problem: str = ""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Subject:
     """A model with its surroundings: what every rule is asked about.
@@ -403,7 +441,7 @@ class Subject:
         projection: of the model's tracks.
         images: None where no folder of images is known.
         downscaled: by factor, the folders images_2, images_4 and so on.
-        masks, database, ply, depth, dense: None where there is none.
+        masks, database, ply, depth, dense, transforms: None where there is none.
         siblings: number of images in the numbered models of the same folder, by name, this one included.
         unread_by_colmap: what pycolmap said when it could not read the model; empty when it could or was not asked.
     """
@@ -417,5 +455,6 @@ class Subject:
     ply: PlyCloud | None = None
     depth: DepthFolder | None = None
     dense: DenseFolder | None = None
+    transforms: TransformsFile | None = None
     siblings: Mapping[str, int] = field(default_factory=dict)
     unread_by_colmap: str = ""

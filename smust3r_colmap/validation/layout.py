@@ -46,6 +46,7 @@ class Layout:
     depths: Path
     depth_params: Path
     ply: Path | None
+    transforms: Path | None
     inner_scenes: tuple[Path, ...]
 
 
@@ -90,6 +91,7 @@ def find_layout(named: Path, *, images: Path | None, database: Path | None) -> L
         depths=scene / "depths",
         depth_params=model / "depth_params.json",
         ply=_file(model / "points3D.ply"),
+        transforms=_file(scene / "transforms.json"),
         inner_scenes=tuple(
             scene / name
             for name in _INNER_SCENES

@@ -64,6 +64,13 @@ _READS_AS_STORED = "reads the pixels as stored, so width and height are swapped"
 _FLOAT32 = "computes with 32-bit numbers and rounds positions"
 _NO_START = "stops: has no points to start from"
 
+_TRANSFORMS_UNUSABLE = {
+    "transforms-unreadable": "stops when it is given transforms.json",
+    "transforms-image-missing": "stops at the first missing file of transforms.json",
+    "transforms-pose-not-rigid": "trains from transforms.json with a camera that is none",
+}
+"""Of nerfstudio's parser of transforms.json and of instant-ngp's loader, by their source."""
+
 _GRAPHDECO = {
     **other_models(_PINHOLES, "stops: only undistorted (SIMPLE_)PINHOLE images are handled"),
     "text-simple-pinhole": "stops: its text reader takes PINHOLE only",
@@ -183,8 +190,8 @@ READERS: tuple[Reader, ...] = (
     ),
     Reader(
         name="nerfstudio",
-        program="nerfstudio, ColmapDataParser and colmap_to_json, July 2025",
-        reads="colmap/sparse/0; .txt before .bin for cameras and images, .bin before .txt for points",
+        program="nerfstudio, ColmapDataParser and colmap_to_json, July 2025; NerfstudioDataParser by its source",
+        reads="colmap/sparse/0 (.txt before .bin for cameras and images, .bin before .txt for points), transforms.json",
         evidence="run",
         refuses={
             **other_models(
@@ -205,8 +212,15 @@ READERS: tuple[Reader, ...] = (
             "image-exif-against-camera": _READS_AS_STORED,
             "mask-missing": "stops when masks are wanted: every image needs one",
             "name-blank-in-text": "reads the name up to the first blank",
+            **_TRANSFORMS_UNUSABLE,
+            "transforms-camera-model": "stops with a KeyError when it is given transforms.json",
+            "transforms-intrinsics": "stops: wants focal lengths, principal point and size, for all or for every frame",
+            "transforms-masks-incomplete": "stops: wants a mask for every frame of transforms.json or for none",
+            "transforms-size-differs": "stops, or samples beside the image, when it is given transforms.json",
         },
         warns={
+            "transforms-points-missing": "has no points to start splats from when it is given transforms.json",
+            "transforms-cameras-differ": "trains other cameras from transforms.json than from the model",
             "camera-id-not-one": "writes intrinsics for every image, as if cameras were not shared",
             "outlier-cameras": "scales the scene by its farthest camera, so the rest becomes tiny",
             "downscaled-list-differs": "misses files of the smaller size",
@@ -217,8 +231,8 @@ READERS: tuple[Reader, ...] = (
     ),
     Reader(
         name="instant-ngp",
-        program="colmap2nerf.py, February 2026",
-        reads=".txt only (convert with pycolmap: write_text)",
+        program="colmap2nerf.py, February 2026; the program itself by its source",
+        reads=".txt only (convert with pycolmap: write_text), or transforms.json",
         evidence="run",
         refuses={
             **other_models(
@@ -236,8 +250,13 @@ READERS: tuple[Reader, ...] = (
             "image-unobserved": "stops at the empty line with an IndexError",
             "name-blank": "makes _ of the blanks and finds no file",
             "image-file-missing": "stops: reads every image for its sharpness",
+            **_TRANSFORMS_UNUSABLE,
         },
-        warns={"coordinates-large": _FLOAT32},
+        warns={
+            "coordinates-large": _FLOAT32,
+            "transforms-size-differs": "takes focal lengths and principal point in pixels of another size",
+            "transforms-cameras-differ": "trains other cameras from transforms.json than from the model",
+        },
     ),
     Reader(
         name="Brush",

@@ -1,7 +1,7 @@
 """What lies around a model: image files, masks, the database, a PLY, depth and a dense workspace.
 
 Of images only the headers are read. Nothing is written, the database is opened for reading only.
-The next module to read is ``layout``.
+The next module to read is ``transforms_file``.
 """
 
 from __future__ import annotations
@@ -49,11 +49,12 @@ def read_image_folder(folder: Path) -> FileFolder:
         for name in names:
             if name.lower().endswith(SUFFIXES) and not name.startswith("."):
                 path = Path(place, name)
-                files.append(_image_file(path, path.relative_to(folder).as_posix()))
+                files.append(read_image_file(path, path.relative_to(folder).as_posix()))
     return FileFolder(folder=folder, files=tuple(sorted(files, key=lambda file: file.name)))
 
 
-def _image_file(path: Path, name: str) -> ImageFile:
+def read_image_file(path: Path, name: str) -> ImageFile:
+    """One image file by its header, to be known as ``name``."""
     try:
         with Image.open(path) as image:
             turned = image.getexif().get(ExifTags.Base.Orientation, 1) in _QUARTER_TURNS

@@ -24,6 +24,7 @@ from smust3r_colmap.validation import (
     checks_images,
     checks_names,
     checks_tracks,
+    checks_transforms,
     text_files,
 )
 from smust3r_colmap.validation.description import Defect, ModelDescription, Subject
@@ -39,10 +40,11 @@ from smust3r_colmap.validation.surroundings import (
     read_image_folder,
     read_ply,
 )
+from smust3r_colmap.validation.transforms_file import read_transforms
 
 _CHECKS = (
     *(checks_files, checks_names, checks_cameras, checks_tracks, checks_geometry),
-    *(checks_images, checks_database, checks_extras),
+    *(checks_images, checks_database, checks_extras, checks_transforms),
 )
 """The modules of the rules, which register themselves when they are imported; a new one is added here."""
 
@@ -100,6 +102,7 @@ def describe(layout: Layout, *, ask_colmap: bool) -> Subject:
         ply=None if layout.ply is None else read_ply(layout.ply),
         depth=read_depth(layout.depth_params, layout.depths),
         dense=read_dense(layout.scene),
+        transforms=None if layout.transforms is None else read_transforms(layout.transforms),
         siblings={name: _num_images(folder) for name, folder in layout.numbered.items()},
         unread_by_colmap=_ask_colmap(layout.model) if ask_colmap else "",
     )
@@ -193,7 +196,7 @@ def _beside(layout: Layout, subject: Subject) -> dict[str, str]:
     if subject.images is not None:
         found["images"] = f"{layout.images} ({len(subject.images.files):,} files)"
     found |= {f"images_{factor}": str(folder) for factor, folder in layout.downscaled.items()}
-    others = {"masks": layout.masks, "database": layout.database, "points": layout.ply}
+    others = {"masks": layout.masks, "database": layout.database, "points": layout.ply, "transforms": layout.transforms}
     found |= {kind: str(path) for kind, path in others.items() if path is not None}
     if subject.depth is not None:
         found["depth"] = f"{layout.depth_params} and {layout.depths}"

@@ -15,7 +15,6 @@ import numpy.typing as npt
 from smust3r_colmap.backbones.base import BackboneContext, BackboneResult
 from smust3r_colmap.backbones.classical.calibration import CalibrationTask, agree_on_cameras, calibrate_segment
 from smust3r_colmap.backbones.classical.dense import DepthTask, make_depth
-from smust3r_colmap.backbones.classical.descriptors import FEATURES_PER_IMAGE, vlad_descriptors
 from smust3r_colmap.backbones.classical.features import (
     Pair,
     match_pairs,
@@ -24,7 +23,7 @@ from smust3r_colmap.backbones.classical.features import (
     plan_pairs,
 )
 from smust3r_colmap.backbones.classical.mapping import MappedSegment, MappingTask, map_segment
-from smust3r_colmap.backbones.classical.run_features import features_of_run
+from smust3r_colmap.backbones.classical.run_features import describe_images, features_of_run
 from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
 from smust3r_colmap.config import ClassicalConfig
 from smust3r_colmap.execution import TaskFailure, map_tasks
@@ -40,7 +39,7 @@ from smust3r_colmap.products import (
     UnregisteredImage,
 )
 from smust3r_colmap.progress import Reporter, Stage
-from smust3r_colmap.run_directory import RunDirectory, StageFolder, key_of, read_arrays, write_arrays
+from smust3r_colmap.run_directory import RunDirectory, StageFolder, key_of
 from smust3r_colmap.stored_maps import EmptyMaps, StoredMaps
 
 logger = logging.getLogger(__name__)
@@ -83,20 +82,7 @@ class ClassicalBackbone:
 
     def describe(self) -> npt.NDArray[np.float32]:
         """VLAD of the SIFT features of every image; see ``Backbone``."""
-        features = self._features
-        stage = self.run.stage("descriptors", key=key_of("descriptors", features.key, features.usable, self.seed))
-        if not stage.is_done:
-            with open_database(features.database) as opened:
-                numbers = range(1, len(self.collection) + 1)
-                sift = [  # copies, for a slice would hold on to all features of the image
-                    np.asarray(opened.read_descriptors(number).data).reshape(-1, 128)[:FEATURES_PER_IMAGE].copy()
-                    for number in numbers
-                ]
-            made = vlad_descriptors(sift, rng=np.random.default_rng(self.seed))
-            with stage.write() as folder:
-                write_arrays(folder / "descriptors.safetensors", {"vlad": made})
-        vlad: npt.NDArray[np.float32] = read_arrays(stage.path / "descriptors.safetensors")["vlad"]
-        return vlad
+        return describe_images(self._features, self.run, seed=self.seed)
 
     def reconstruct(self, segments: Sequence[Segment], *, with_maps: Collection[int]) -> BackboneResult:
         """All segments of the run; see ``Backbone``."""

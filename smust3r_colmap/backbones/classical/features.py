@@ -25,6 +25,7 @@ from smust3r_colmap.errors import StorageError
 from smust3r_colmap.execution import TaskFailure, map_tasks
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.images import load_grey
+from smust3r_colmap.importers.masks import load_mask
 from smust3r_colmap.products import ImageCollection, RejectedImage, Segment, SourceImage, consecutive_runs
 from smust3r_colmap.progress import Stage
 
@@ -130,8 +131,8 @@ def extract_features(
     """Extract SIFT for every image that has no keypoints yet; returns the images that failed.
 
     Keypoints are in pixels of the original image (first pixel centre at 0.5), whatever
-    ``max_image_size`` they were found at. An image that fails gets none and is tried again at the
-    next start.
+    ``max_image_size`` they were found at, and none lies on a pixel that the image's mask leaves out.
+    An image that fails gets none and is tried again at the next start.
     """
     failed = []
     with open_database(path) as database:
@@ -173,13 +174,30 @@ def _extract(task: _ExtractionTask) -> _Features:
         small = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     else:
         small = grey
-    features = _sift(small, task.max_features, peak_threshold=None)
+    kept = None if task.image.mask is None else load_mask(task.image.mask.path, task.image) > 0
+    shrunk = (grey.shape[1] / small.shape[1], grey.shape[0] / small.shape[0])
+    features = _unmasked(_enlarged(_sift(small, task.max_features, peak_threshold=None), *shrunk), kept)
     if len(features.keypoints) < task.max_features // 4:
-        features = _sift(small, task.max_features, peak_threshold=_SPARSE_PEAK_THRESHOLD)
-    features.keypoints[:, 0] *= grey.shape[1] / small.shape[1]
-    features.keypoints[:, 1] *= grey.shape[0] / small.shape[0]
-    features.keypoints[:, 2] *= grey.shape[1] / small.shape[1]
+        more = _sift(small, task.max_features, peak_threshold=_SPARSE_PEAK_THRESHOLD)
+        features = _unmasked(_enlarged(more, *shrunk), kept)
     return features
+
+
+def _enlarged(features: _Features, times_x: float, times_y: float) -> _Features:
+    """From the pixels of a smaller image to those of the original."""
+    x, y, scale, orientation = features.keypoints.T
+    keypoints = np.column_stack([x * times_x, y * times_y, scale * times_x, orientation]).astype(np.float32)
+    return _Features(keypoints=keypoints, descriptors=features.descriptors)
+
+
+def _unmasked(features: _Features, kept: npt.NDArray[np.bool_] | None) -> _Features:
+    """Features whose centre lies on a pixel that is kept, as in COLMAP: SIFT has seen the masked pixels beside it."""
+    if kept is None:
+        return features
+    height, width = kept.shape
+    column, row = np.floor(features.keypoints[:, :2]).astype(np.int64).T
+    there = kept[row.clip(0, height - 1), column.clip(0, width - 1)]
+    return _Features(keypoints=features.keypoints[there], descriptors=features.descriptors[there])
 
 
 def _sift(grey: npt.NDArray[np.uint8], max_features: int, *, peak_threshold: float | None) -> _Features:
