@@ -1,4 +1,4 @@
-"""Fixtures that more than one test file uses."""
+"""Fixtures that more than one test file uses, and what several processes of tests need (``pytest -n 2``)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,28 @@ import pytest
 
 if TYPE_CHECKING:
     from finished_runs import Example
+
+ONE_OF_SEVERAL = "PYTEST_XDIST_WORKER" in os.environ
+SLOW_FILES = (
+    "test_real_data.py",
+    "test_pipeline.py",
+    "test_must3r_network.py",
+    "test_must3r_room.py",
+    "test_must3r_backbone.py",
+    "test_refine_command.py",
+)
+"""From half a minute up, the slowest first."""
+
+if ONE_OF_SEVERAL:
+    # Before numpy and torch are loaded: threads of several processes would wait for each other on the same cores.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Several processes take the slow files first, so that none is left at the end with one of them to do."""
+    if ONE_OF_SEVERAL:
+        rank = {name: k for k, name in enumerate(SLOW_FILES)}
+        items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
 
 
 @pytest.fixture(scope="session")

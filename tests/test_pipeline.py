@@ -37,15 +37,20 @@ from smust3r_colmap.progress import QuietReporter
 from smust3r_colmap.summary import RunSummary
 
 NUM_IMAGES = 24
+NUM_BRIEF = 12
+"""The first images of the room, for tests of something else than where its cameras are: half a walk."""
 
+# One process: in runs this small, starting a second one costs more than it brings. `finished` has as many as there
+# are cores.
 CONFIG = RunConfig(
+    workers=1,
     segmentation=SegmentationConfig(segment_length=14, overlap=7),
     classical=ClassicalConfig(max_features=1200, dense_size=160, depth_planes=32),
     fusion=FusionConfig(max_points=20_000),
     output=OutputConfig(text=True, trainer=False, dense=False),
 )
 
-
+BRIEF = replace(CONFIG, segmentation=SegmentationConfig(segment_length=8, overlap=4))
 WITHOUT_TEXT = replace(CONFIG, output=OutputConfig(trainer=False, dense=False))
 UNREFINED = replace(CONFIG, refinement=RefinementConfig(refine=False))
 NO_LOOPS = LoopConfig(loops=False)
@@ -60,8 +65,31 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def finished(room: Path, tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
-    everything = replace(CONFIG, output=OutputConfig(text=True))
+    everything = replace(CONFIG, output=OutputConfig(text=True), workers=0)
     return run(room / "images", tmp_path_factory.mktemp("run") / "out", everything)
+
+
+@pytest.fixture(scope="module")
+def brief_walk(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of its photographs."""
+    images = tmp_path_factory.mktemp("brief") / "images"
+    copy_photographs(room, images, NUM_BRIEF)
+    return images
+
+
+@pytest.fixture(scope="module")
+def brief(brief_walk: Path) -> RunSummary:
+    """A finished run of two segments, to be copied, stopped, resumed and changed."""
+    summary = run(brief_walk, brief_walk.parent / "out", BRIEF)
+    assert len(summary.segments) == 2
+    assert summary.num_registered == NUM_BRIEF
+    return summary
+
+
+def copy_photographs(room: Path, folder: Path, count: int) -> None:
+    folder.mkdir()
+    for path in sorted((room / "images").iterdir())[:count]:
+        shutil.copy(path, folder)
 
 
 def run(images: Path, output: Path, config: RunConfig = CONFIG) -> RunSummary:
@@ -93,14 +121,14 @@ def test_the_focal_length_is_found_at_the_original_size(finished: RunSummary, ro
     assert tuple(camera.params[1:3]) == pytest.approx((width / 2, height / 2), abs=0.01 * width)
 
 
-def test_a_known_calibration_is_kept_to_the_last_digit(room: Path, tmp_path: Path) -> None:
+def test_a_known_calibration_is_kept_to_the_last_digit(room: Path, brief_walk: Path, tmp_path: Path) -> None:
     params = (room / "intrinsics.txt").read_text().split("\n")[1].split()[2:]
     known = ImportConfig(camera_model="PINHOLE", camera_params=",".join(params))
-    summary = run(room / "images", tmp_path / "out", replace(CONFIG, importing=known, loop_closing=NO_LOOPS))
+    summary = run(brief_walk, tmp_path / "out", replace(BRIEF, importing=known, loop_closing=NO_LOOPS))
     (camera,) = pycolmap.Reconstruction(tmp_path / "out/sparse/0").cameras.values()
     assert (camera.model.name, [*camera.params]) == ("PINHOLE", [float(value) for value in params])
     poses = read_reference_sparse(tmp_path / "out/sparse/0")
-    assert summary.num_registered == NUM_IMAGES
+    assert summary.num_registered == NUM_BRIEF
     assert compare_trajectories(poses, read_poses_txt(room / "poses.txt")).position_rmse < 0.02
 
 
@@ -155,29 +183,31 @@ def test_a_second_start_repeats_nothing_and_gives_the_same_model(finished: RunSu
     assert computed == {"import", "pose graph", "export"}
 
 
-def test_a_changed_setting_redoes_its_stage_and_what_follows(finished: RunSummary, room: Path, tmp_path: Path) -> None:
+def test_a_changed_setting_redoes_its_stage_and_what_follows(
+    brief: RunSummary, brief_walk: Path, tmp_path: Path
+) -> None:
     copy = tmp_path / "out"
-    shutil.copytree(finished.output, copy)
-    denser = replace(CONFIG, classical=replace(CONFIG.classical, dense_size=120))
-    again = reused(run(room / "images", copy, denser))
+    shutil.copytree(brief.output, copy)
+    denser = replace(BRIEF, classical=replace(BRIEF.classical, dense_size=120))
+    again = reused(run(brief_walk, copy, denser))
     assert {name for name, was_reused in again.items() if was_reused} == {
         "features", "loops", "matching", "mapping", "calibration", "alignment",
     }  # fmt: skip
     fewer_points = replace(denser, fusion=FusionConfig(max_points=5_000))
-    again = reused(run(room / "images", copy, fewer_points))
+    again = reused(run(brief_walk, copy, fewer_points))
     assert not again["fusion"]
     assert again["depth"]
     assert again["alignment"]
 
 
-def test_renamed_images_have_their_new_names_in_the_model(finished: RunSummary, room: Path, tmp_path: Path) -> None:
-    shutil.copytree(finished.output, tmp_path / "out")
-    shutil.copytree(room / "images", tmp_path / "images")
+def test_renamed_images_have_their_new_names_in_the_model(brief: RunSummary, brief_walk: Path, tmp_path: Path) -> None:
+    shutil.copytree(brief.output, tmp_path / "out")
+    shutil.copytree(brief_walk, tmp_path / "images")
     for path in sorted((tmp_path / "images").iterdir()):
         path.rename(path.with_name(f"renamed_{path.name}"))
-    again = run(tmp_path / "images", tmp_path / "out")
+    again = run(tmp_path / "images", tmp_path / "out", BRIEF)
     names = {image.name for image in pycolmap.Reconstruction(tmp_path / "out/sparse/0").images.values()}
-    assert names == {f"renamed_{k:06d}.jpg" for k in range(NUM_IMAGES)}
+    assert names == {f"renamed_{k:06d}.jpg" for k in range(NUM_BRIEF)}
     assert reused(again)["depth"]
 
 
@@ -186,17 +216,17 @@ KILL_AFTER = ("features: ", "mapping: ", "depth: ", "refinement: ", "fusion: ")
 
 @pytest.mark.parametrize("line", KILL_AFTER)
 def test_killed_in_the_middle_of_a_stage_it_goes_on_to_the_same_model(
-    line: str, finished: RunSummary, room: Path, tmp_path: Path
+    line: str, brief: RunSummary, brief_walk: Path, tmp_path: Path
 ) -> None:
     """kill -9 when the stage begins; only the import and what was not finished may be done again."""
     output = tmp_path / "out"
     config = tmp_path / "config.toml"
-    config.write_text(config_to_toml(CONFIG))
+    config.write_text(config_to_toml(BRIEF))
     stages = ["features", "matching", "mapping", "calibration", "depth", "alignment", "placing", "refinement", "fusion"]
     reached = stages.index(line.split(":", maxsplit=1)[0])
-    prepared = _copy_of_finished_stages(finished.output, output, stages[:reached])
-    command = [sys.executable, "-m", "smust3r_colmap", "reconstruct", str(room / "images")]
-    command += ["--output", str(output), "--config", str(config)]
+    prepared = _copy_of_finished_stages(brief.output, output, stages[:reached])
+    command = [sys.executable, "-m", "smust3r_colmap", "reconstruct", str(brief_walk)]
+    command += ["--output", str(output), "--config", str(config), "--workers", "2"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:
         assert process.stderr is not None
         for said in process.stderr:
@@ -205,11 +235,11 @@ def test_killed_in_the_middle_of_a_stage_it_goes_on_to_the_same_model(
                 break
     assert process.returncode == -9
     assert not (output / "summary.json").exists()
-    again = reused(run(room / "images", output))
+    again = reused(run(brief_walk, output, BRIEF))
     assert all(again[name] for name in prepared)
     for name in ("images.bin", "points3D.bin", "cameras.bin"):
         found = (output / "sparse/0" / name).read_bytes()
-        assert found == (finished.output / "sparse/0" / name).read_bytes(), name
+        assert found == (brief.output / "sparse/0" / name).read_bytes(), name
 
 
 def _copy_of_finished_stages(source: Path, output: Path, stages: list[str]) -> list[str]:
@@ -254,9 +284,7 @@ def test_images_without_overlap_fail_with_what_was_tried(tmp_path: Path) -> None
 
 def test_strangers_among_the_images_are_left_out_by_name(room: Path, tmp_path: Path) -> None:
     images = tmp_path / "images"
-    images.mkdir()
-    for k in range(10):
-        shutil.copy(room / "images" / f"{k:06d}.jpg", images)
+    copy_photographs(room, images, 10)
     write_noise(tmp_path / "noise", 1)
     shutil.copy(tmp_path / "noise/0.png", images / "000004_stranger.png")
     (images / "000005_broken.jpg").write_bytes((room / "images/000005.jpg").read_bytes()[:4000])
@@ -270,9 +298,7 @@ def test_strangers_among_the_images_are_left_out_by_name(room: Path, tmp_path: P
 def test_two_unconnected_rooms_become_two_models_largest_first(room: Path, tmp_path: Path) -> None:
     images = tmp_path / "images"
     images.mkdir()
-    write_demo(tmp_path / "other", num_images=24, width=320, height=240, seed=5)
-    for k in range(6):
-        shutil.copy(tmp_path / f"other/images/{k:06d}.jpg", images / f"a{k}.jpg")
+    photograph(DemoScene(5), images, num_images=24, count=6)
     for k in range(10):
         shutil.copy(room / f"images/{k:06d}.jpg", images / f"b{k}.jpg")
     summary = run(images, tmp_path / "out", replace(CONFIG, segmentation=SegmentationConfig()))
@@ -284,14 +310,18 @@ def test_two_unconnected_rooms_become_two_models_largest_first(room: Path, tmp_p
     assert pycolmap.Reconstruction(tmp_path / "out/sparse/1").num_reg_images() == 6
 
 
+def photograph(scene: DemoScene, folder: Path, *, num_images: int, count: int) -> None:
+    """The first ``count`` views of a round of ``num_images``, as a0.png and on."""
+    for k, world_from_cam in enumerate(scene.camera_path(num_images)[:count]):
+        rgb, _ = scene.render(world_from_cam, demo_intrinsics(320, 240))
+        cv2.imwrite(str(folder / f"a{k}.png"), rgb[:, :, ::-1])
+
+
 @pytest.mark.parametrize("count", [2, 3])
 def test_a_handful_of_photographs_is_enough(count: int, tmp_path: Path) -> None:
     images = tmp_path / "images"
     images.mkdir()
-    scene = DemoScene()
-    for k, world_from_cam in enumerate(scene.camera_path(72)[:count]):
-        rgb, _ = scene.render(world_from_cam, demo_intrinsics(320, 240))
-        cv2.imwrite(str(images / f"{k}.png"), rgb[:, :, ::-1])
+    photograph(DemoScene(), images, num_images=72, count=count)
     summary = run(images, tmp_path / "out")
     assert summary.exit_code == 0
     assert summary.models[0].num_images == count
@@ -315,13 +345,14 @@ def test_an_output_among_the_images_is_refused(room: Path) -> None:
 
 
 # ----------------------------------------------------------------------------- loops
-ROUND = replace(CONFIG, segmentation=SegmentationConfig(segment_length=12, overlap=6))
+NUM_ROUND = 36
+ROUND = replace(CONFIG, segmentation=SegmentationConfig(segment_length=10, overlap=5))
 
 
 @pytest.fixture(scope="module")
 def round_trip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("round")
-    write_demo(folder, num_images=48, width=320, height=240)
+    write_demo(folder, num_images=NUM_ROUND, width=320, height=240)
     return folder
 
 
@@ -340,11 +371,11 @@ def test_a_walk_that_comes_back_is_closed_and_a_run_without_loops_is_not(round_t
     assert all(candidate["reason"] for candidate in plan["candidates"])
     truth = read_poses_txt(round_trip / "poses.txt")
     found = compare_trajectories(read_reference_sparse(tmp_path / "out/sparse/0"), truth)
-    assert found.num_compared == summary.num_registered == 48
+    assert found.num_compared == summary.num_registered == NUM_ROUND
     assert found.position_rmse < 0.02
     before = np.loadtxt(tmp_path / "out/trajectory_without_loops_tum.txt")
     after = np.loadtxt(tmp_path / "out/trajectory_tum.txt")
-    assert before.shape == after.shape == (48, 8)
+    assert before.shape == after.shape == (NUM_ROUND, 8)
     assert not np.allclose(before[:, 1:], after[:, 1:], atol=1e-6)
 
     without = replace(ROUND, loop_closing=LoopConfig(loops=False), refinement=UNREFINED.refinement)

@@ -112,7 +112,8 @@ def test_the_loop_round_a_courtyard_is_found_and_closed(data_dir: Callable[[str]
     config = replace(
         CONFIG,
         segmentation=SegmentationConfig(segment_length=12, overlap=6),
-        classical=replace(CONFIG.classical, max_image_size=800, dense_size=128),
+        classical=replace(CONFIG.classical, max_image_size=640, max_features=2000, dense_size=128),
+        workers=1,
     )
     summary, found = run(folder, names, tmp_path, config)
     (loop,) = summary.loops
