@@ -1,6 +1,6 @@
 """Pictures of a finished run's cloud, to look for double walls: from above, from the side, and a camera's own view.
 
-    python scripts/render_cloud.py OUT picture.png [--image 10]
+    python scripts/render_cloud.py OUT picture.png [--image 10] [--cloud OUT/dense/fused.ply]
 
 The floor plan is seen along the mean up direction of the cameras. Nearer points cover farther ones.
 """
@@ -8,6 +8,8 @@ The floor plan is seen along the mean up direction of the cameras. Nearer points
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,8 @@ import numpy.typing as npt
 import pycolmap
 import trimesh
 from PIL import Image
+
+from smust3r_colmap.errors import InputError
 
 FloatArray = npt.NDArray[np.float64]
 UInt8Array = npt.NDArray[np.uint8]
@@ -24,18 +28,15 @@ BACKGROUND = 255
 CAMERA_RGB = (220, 30, 30)
 
 
-def main() -> None:
-    """Read the run, draw three views beside each other, write the picture."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("run", type=Path, help="output folder of smust3r-colmap reconstruct")
-    parser.add_argument("picture", type=Path, help="PNG to write")
-    parser.add_argument("--image", type=int, default=0, help="which registered image's view to draw (0 is the first)")
-    arguments = parser.parse_args()
-
-    cloud = trimesh.load(arguments.run / "points.ply", process=False)
-    assert isinstance(cloud, trimesh.PointCloud)
-    xyz, rgb = np.asarray(cloud.vertices, dtype=np.float64), np.asarray(cloud.colors)[:, :3]
-    model = pycolmap.Reconstruction(arguments.run / "sparse/0")
+def main(words: Sequence[str] | None = None) -> int:
+    """Read the run, draw three views beside each other, write the picture; the exit code is 2 when it cannot be."""
+    arguments = parse_arguments(words)
+    try:
+        xyz, rgb = read_cloud(arguments.cloud or arguments.run / "points.ply")
+        model = read_model(arguments.run / "sparse/0")
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
     images = [model.image(i) for i in sorted(model.reg_image_ids())]
     centres = np.array([image.projection_center() for image in images])
     level_from_world = level_frame(images)
@@ -48,6 +49,52 @@ def main() -> None:
     seen = perspective(xyz, rgb, image, model.camera(image.camera_id))
     Image.fromarray(np.concatenate([above, side, seen], axis=1)).save(arguments.picture)
     print(f"{arguments.picture}: from above, from the side, and the view of {image.name}; {len(xyz)} points")
+    return 0
+
+
+def parse_arguments(words: Sequence[str] | None) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("run", type=Path, help="output folder of smust3r-colmap reconstruct")
+    parser.add_argument("picture", type=Path, help="PNG to write")
+    parser.add_argument("--image", type=int, default=0, help="which registered image's view to draw (0 is the first)")
+    parser.add_argument(
+        "--cloud",
+        type=Path,
+        metavar="FILE",
+        help="coloured PLY in the model's world, such as dense/fused.ply (OUT/points.ply)",
+    )
+    return parser.parse_args(words)
+
+
+def read_cloud(path: Path) -> tuple[FloatArray, UInt8Array]:
+    """(P, 3) points and their (P, 3) colours.
+
+    Raises:
+        InputError: there is no such file, or it is no cloud of points with colours.
+    """
+    try:
+        cloud = trimesh.load(path, process=False)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as a cloud: {error}") from error
+    if not isinstance(cloud, trimesh.PointCloud):
+        raise InputError(f"{path}: has faces, or no points; needed a cloud")
+    xyz, rgba = np.asarray(cloud.vertices, dtype=np.float64), np.asarray(cloud.colors, dtype=np.uint8)
+    if len(rgba) != len(xyz):
+        raise InputError(f"{path}: {len(rgba)} colours of {len(xyz)} points, needed one for each")
+    return xyz, rgba[:, :3]
+
+
+def read_model(folder: Path) -> pycolmap.Reconstruction:
+    """The largest model of a run.
+
+    Raises:
+        InputError: there is none.
+    """
+    try:
+        return pycolmap.Reconstruction(folder)
+    except (ValueError, RuntimeError, OSError) as error:
+        raise InputError(f"{folder}: no COLMAP model; is this the output of a finished run? ({error})") from error
 
 
 def level_frame(images: list[pycolmap.Image]) -> FloatArray:
@@ -105,4 +152,4 @@ def perspective(xyz: FloatArray, rgb: UInt8Array, image: pycolmap.Image, camera:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
