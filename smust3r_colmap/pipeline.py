@@ -44,10 +44,11 @@ from smust3r_colmap.finished_run import FinishedRun, forget_finished, write_fini
 from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.importers.image_folder import (
+    check_masks_not_inside,
     check_output_not_inside,
     collection_from_scan,
 )
-from smust3r_colmap.importers.masks import names_without_mask, with_masks
+from smust3r_colmap.importers.masks import masks_of, names_without_mask, with_masks
 from smust3r_colmap.loops.planning import LoopPlan, plan_loops
 from smust3r_colmap.masked_maps import without_masked_depth
 from smust3r_colmap.model_depth import depth_scales
@@ -113,6 +114,7 @@ def reconstruct(
         RunDirectoryError: the output folder cannot be used, is held by another run, or the disk refused.
     """
     check_output_not_inside(images, output)
+    check_masks_not_inside(images, config.importing.masks)
     with RunDirectory(output, fresh=fresh) as run:
         forget_finished(run)
         clock = StageClock(reporter)
@@ -132,7 +134,7 @@ def reconstruct(
         refinement = _refine(stitched, result, windows, collection, config, run, clock)
         scenes = _fuse(refinement, stitched, result, segments, stitching.parts, config, run, clock)
         unclosed = _without_loops(result, segments, stitching, collection, clock)
-        outputs = _export(scenes, stitched, refinement, unclosed, images, config, run, clock)
+        outputs = _export(scenes, stitched, refinement, unclosed, images, collection, config, run, clock)
         summary = _summarise(
             collection, segments, plan, result, edges, stitching, scenes, refinement, outputs, run, clock
         )
@@ -488,6 +490,7 @@ def _export(
     refinement: Refinement | None,
     unclosed: Scene | None,
     images: Path,
+    collection: ImageCollection,
     config: RunConfig,
     run: RunDirectory,
     clock: StageClock,
@@ -502,7 +505,7 @@ def _export(
         models=(None,) * len(scenes) if refinement is None else refinement.models,
         database=None if refinement is None or not any(refinement.models) else refinement.database,
         maps=stitched.maps,
-        masks=Path(config.importing.masks) if config.importing.masks else None,
+        masks=masks_of(collection, config.importing.masks),
     )
     with clock.stage("export", total=1) as stage:
         settings = FormatSettings.of(config.output)
@@ -610,6 +613,7 @@ def refinement_summaries(
             weak=tuple(collection.images[i].name for i in one.weak),
             registered=tuple(collection.images[i].name for i in one.registered),
             principal_point=one.principal_point,
+            doubts=one.doubts,
             steps=tuple(
                 RefinementStep(
                     name=step.name,

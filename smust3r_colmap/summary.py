@@ -203,6 +203,7 @@ class RefinementSummary:
         weak: images with fewer than 15 observations, which keep their stitched place.
         registered: images that had no pose before.
         principal_point: whether it was freed, and why not, in words; empty where that was never asked.
+        doubts: what speaks against a model that has tracks, in words.
         steps: in order.
     """
 
@@ -219,6 +220,7 @@ class RefinementSummary:
     weak: tuple[str, ...]
     registered: tuple[str, ...]
     principal_point: str
+    doubts: tuple[str, ...]
     steps: tuple[RefinementStep, ...]
 
 
@@ -319,6 +321,7 @@ class RunSummary:
         num_weak = sum(len(one.weak) for one in self.refinements if one.kept)
         if num_weak:
             reasons.append(f"{num_weak} images rest on fewer than 15 observations; they keep their stitched place")
+        reasons += [f"{one.folder}: {doubt}" for one in self.refinements if one.kept for doubt in one.doubts]
         reasons += [f"no {one.name}: {one.reason}" for one in self.missing_outputs]
         return tuple(reasons)
 

@@ -35,6 +35,7 @@ from smust3r_colmap.summary import (
     GraphSummary,
     ImageRemark,
     ModelSummary,
+    RefinementSummary,
     RunSummary,
     SegmentSummary,
     StageSummary,
@@ -125,6 +126,23 @@ def test_good_run_exits_0_with_the_summary_on_stdout(
     assert (call.images, call.output, call.fresh) == (Path("photos"), Path("out"), True)
 
 
+REFINED = RefinementSummary(
+    folder="sparse/0",
+    kept=True,
+    reason="",
+    num_points=100,
+    num_observations=300,
+    mean_track_length=3.0,
+    reprojection_error_px=0.5,
+    num_pairs=10,
+    num_matches=300,
+    num_refused_pairs=0,
+    weak=(),
+    registered=(),
+    principal_point="",
+    doubts=(),
+    steps=(),
+)
 WEAK = replace(GOOD, num_registered=4, unregistered=(ImageRemark(name="a.jpg", reason="too few matches"),))
 
 
@@ -508,6 +526,15 @@ def test_metric_needs_every_model() -> None:
             replace(GOOD, segments=(replace(GOOD.segments[0], index=7, num_pieces=0, num_registered=0),)),
             "nothing came out of segment 7",
         ),
+        (
+            replace(GOOD, refinements=(replace(REFINED, doubts=("no adjustment stood: it diverged",)),)),
+            "sparse/0: no adjustment stood: it diverged",
+        ),
+        (
+            replace(GOOD, refinements=(replace(REFINED, kept=False, reason="no point"),)),
+            "the largest model has no tracks: no point",
+        ),
+        (replace(GOOD, refinements=(replace(REFINED, weak=("a.jpg",)),)), "1 images rest on fewer than 15"),
     ],
 )
 def test_each_shortcoming_makes_the_result_weak(summary: RunSummary, reason: str) -> None:

@@ -540,6 +540,7 @@ def test_adjustments_that_diverge_are_undone_and_reported(tmp_path: Path, monkey
     assert len(undone) >= 3
     assert not any(step.kept for step in undone)
     assert all("focal length of camera 1 went to 3 times" in step.reason for step in undone)
+    assert f"no adjustment stood: {undone[-1].reason}" in figures.doubts
     assert tuple(result.model().camera(1).params) == CAMERA.params
     poses = poses_of(result.model())
     for i, pose in enumerate(stitched):

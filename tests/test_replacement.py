@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 from tracked_scenes import (
+    Matches,
     World,
     angle_deg,
     arc,
@@ -17,6 +20,7 @@ from tracked_scenes import (
     make_collection,
     make_world,
     pairs_within,
+    stitched_scene,
     true_matches,
     write_features,
 )
@@ -27,9 +31,12 @@ from smust3r_colmap.refinement import replacement
 from smust3r_colmap.refinement.adjustment import Tolerance, triangulate
 from smust3r_colmap.refinement.bench import TIGHT_PART, Bench, poses_of, views_of
 from smust3r_colmap.refinement.feature_matches import MatchedFeatures, ask_consent, read_matched_features
-from smust3r_colmap.refinement.replacement import Replacement, bent_images, place_bent_images_again
+from smust3r_colmap.refinement.replacement import Replacement, place_bent_images_again
+from smust3r_colmap.refinement.task import RefineTask, refine_scenes
+from smust3r_colmap.run_directory import StageFolder
 
 NUM_IMAGES, LAST_SOUND = 14, 9
+BENT = range(LAST_SOUND + 1, NUM_IMAGES)
 TOLERANCE = Tolerance(pixels=TIGHT_PART * 640, angle_deg=2.0)
 
 
@@ -60,9 +67,15 @@ def bent_after(world: World, last: int, turn_deg: float) -> FloatArray:
 
 def bench_with(world: World, cam_from_world: FloatArray, folder: Path) -> tuple[Bench, MatchedFeatures]:
     """A model with tracks at the given poses, as the first adjustment leaves it."""
-    collection = make_collection(folder, len(world))
     pairs = pairs_within(range(len(world)), 4)
-    write_features(folder / "run.db", collection, world, verified={pair: true_matches(world, pair) for pair in pairs})
+    return bench_of(world, cam_from_world, folder, {pair: true_matches(world, pair) for pair in pairs})
+
+
+def bench_of(
+    world: World, cam_from_world: FloatArray, folder: Path, verified: Matches
+) -> tuple[Bench, MatchedFeatures]:
+    collection = make_collection(folder, len(world))
+    write_features(folder / "run.db", collection, world, verified=verified)
     features = read_matched_features(folder / "run.db", range(len(world)))
     poses = dict(enumerate(cam_from_world))
     consent = ask_consent(features, views_of(poses, collection.cameras, collection), tolerance=TIGHT_PART)
@@ -88,12 +101,21 @@ def straightened(world: World, tmp_path_factory: pytest.TempPathFactory) -> Repl
 
 
 def test_images_beyond_the_bend_come_back_to_the_truth(world: World, straightened: Replacement) -> None:
-    assert straightened.bent == straightened.placed == tuple(range(LAST_SOUND + 1, NUM_IMAGES))
+    assert sorted(straightened.cam_from_world) == list(BENT)
     distance, turn = off_by(world, poses_of(straightened.bench.model))
     assert distance < 0.01
     assert turn < 0.5
-    assert straightened.share_before < 0.9
-    assert straightened.share_after > 0.97
+
+
+def test_the_step_is_reported(straightened: Replacement) -> None:
+    report = straightened.report
+    assert report is not None
+    assert report.kept
+    assert report.name == "images placed again"
+    assert 5 < report.max_moved_percent < 50
+    assert report.moved_percent == pytest.approx(0, abs=1e-6), "most cameras stay"
+    assert report.after.num_observations > report.before.num_observations
+    assert report.after.num_images == report.before.num_images == NUM_IMAGES
 
 
 def test_the_others_stay_to_the_last_bit(world: World, straightened: Replacement) -> None:
@@ -114,26 +136,39 @@ def test_a_sound_model_is_left_alone(world: World, tmp_path: Path) -> None:
     bench, features = bench_with(world, world.cam_from_world, tmp_path)
     result = place_bent_images_again(bench, features, TOLERANCE)
     assert result.bench is bench
-    assert (result.bent, result.placed) == ((), ())
+    assert result.report is None
+    assert result.cam_from_world == {}
 
 
-def test_new_places_that_agree_less_are_not_taken(
+def refused(result: Replacement, bench: Bench, reason: str) -> None:
+    """Nothing was changed, and the report says why."""
+    assert result.bench is bench
+    assert result.cam_from_world == {}
+    assert result.report is not None
+    assert not result.report.kept
+    assert re.fullmatch(reason, result.report.reason), result.report.reason
+    assert result.report.max_moved_percent < 1e-9
+    assert result.report.after == result.report.before
+
+
+def test_new_places_that_fewer_matches_agree_with_are_not_taken(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bent = bent_after(world, LAST_SOUND, 12.0)
     worse = bent_after(world, LAST_SOUND, 25.0)
-    bench, features = bench_with(world, bent, tmp_path)
-    num_points = bench.model.num_points3D()
-    anew = {i: worse[i] for i in range(LAST_SOUND + 1, NUM_IMAGES)}
-    monkeypatch.setattr(replacement, "_mapped_anew", lambda *_: anew)
+    bench, features = bench_with(world, bent_after(world, LAST_SOUND, 12.0), tmp_path)
+    monkeypatch.setattr(replacement, "_mapped_anew", lambda *_: {i: worse[i] for i in BENT})
     result = place_bent_images_again(bench, features, TOLERANCE)
-    assert result.bench is bench
-    assert result.bent
-    assert result.placed == ()
-    assert result.share_after < result.share_before
-    assert "4 images were bent" in result.summary
-    np.testing.assert_allclose(poses_of(bench.model)[NUM_IMAGES - 1], bent[-1], rtol=0, atol=1e-12)
-    assert bench.model.num_points3D() == num_points
+    refused(result, bench, r"4 images are bent, and of their matches \d+ agree with new places, \d+ with the old")
+
+
+def test_images_that_are_bent_in_new_places_too_stay_in_the_old_ones(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench, features = bench_with(world, bent_after(world, LAST_SOUND, 25.0), tmp_path)
+    less = bent_after(world, LAST_SOUND, 12.0)
+    monkeypatch.setattr(replacement, "_mapped_anew", lambda *_: {i: less[i] for i in BENT})
+    result = place_bent_images_again(bench, features, TOLERANCE)
+    refused(result, bench, r"4 images are bent, and \d of them also in new places")
 
 
 def test_bent_images_stay_where_the_mapper_finds_nothing(
@@ -142,9 +177,7 @@ def test_bent_images_stay_where_the_mapper_finds_nothing(
     monkeypatch.setattr(replacement, "_map_globally", _no_model)
     bench, features = bench_with(world, bent_after(world, LAST_SOUND, 12.0), tmp_path)
     result = place_bent_images_again(bench, features, TOLERANCE)
-    assert result.bench is bench
-    assert len(result.bent) == NUM_IMAGES - LAST_SOUND - 1
-    assert result.placed == ()
+    refused(result, bench, "4 images are bent, and the global mapper does not tie them to their neighbours")
 
 
 def _no_model(_: object) -> bool:
@@ -155,23 +188,57 @@ def test_too_many_bent_images_are_another_matter(world: World, tmp_path: Path, m
     monkeypatch.setattr(replacement, "MAX_BENT", 3)
     bench, features = bench_with(world, bent_after(world, LAST_SOUND, 12.0), tmp_path)
     result = place_bent_images_again(bench, features, TOLERANCE)
-    assert len(result.bent) == 4
-    assert result.placed == ()
+    refused(result, bench, "4 images are bent, and more than 3 are not placed again")
 
 
-def test_the_bulk_is_what_sound_pairs_tie_together() -> None:
-    shares = {(0, 1): 0.9, (1, 2): 0.86, (2, 3): 0.84, (3, 4): 1.0, (0, 2): 0.2}
-    assert bent_images(shares, range(5)) == (3, 4)
+@pytest.mark.parametrize("num_true", [12, 25])
+def test_look_alikes_do_not_move_an_image_that_stands_right(world: World, tmp_path: Path, num_true: int) -> None:
+    """The last image also shows what the third sees: many matches with images there, few with its neighbours."""
+    last, rng = NUM_IMAGES - 1, np.random.default_rng(1)
+    twin = make_world(world.cam_from_world[[2]], world.points, rng, clutter=0)
+    first_ghost = len(world.keypoints[last])
+    ghosts = np.full(len(twin.keypoints[0]), -1)
+    seen = replace(
+        world,
+        keypoints=(*world.keypoints[:last], np.concatenate([world.keypoints[last], twin.keypoints[0]])),
+        point_of=(*world.point_of[:last], np.concatenate([world.point_of[last], ghosts])),
+    )
+    verified = {pair: true_matches(seen, pair) for pair in pairs_within(range(NUM_IMAGES), 4)}
+    verified |= {pair: rows[:num_true] for pair, rows in verified.items() if last in pair}
+    for image in (0, 1, 2, 3):
+        alike = replace(twin, point_of=(world.point_of[image], twin.point_of[0]))
+        verified[image, last] = true_matches(alike, (0, 1))[:60] + np.array([0, first_ghost], np.uint32)
+    bench, features = bench_of(seen, world.cam_from_world, tmp_path, verified)
+    assert min(len(verified[image, last]) for image in (0, 1, 2, 3)) > 2 * num_true
+    result = place_bent_images_again(bench, features, TOLERANCE)
+    assert result.bench is bench
+    distance, _ = off_by(world, poses_of(bench.model))
+    assert distance < 1e-9
 
 
-def test_an_image_of_which_no_pair_speaks_is_not_called_bent() -> None:
-    assert bent_images({(0, 1): 0.9, (1, 2): 0.9, (2, 3): 0.1}, range(5)) == (3,)
-
-
-def test_without_a_bulk_nothing_can_be_told() -> None:
-    assert bent_images({(0, 1): 0.9, (2, 3): 0.9, (1, 2): 0.1}, range(4)) == ()
-    assert bent_images({}, range(4)) == ()
-
-
-def test_indices_of_the_collection_need_not_begin_at_zero() -> None:
-    assert bent_images({(10, 12): 0.9, (12, 17): 0.9, (17, 30): 0.5}, [10, 12, 17, 30]) == (30,)
+def test_refinement_straightens_a_bend_and_keeps_the_scale(world: World, tmp_path: Path) -> None:
+    collection = make_collection(tmp_path, NUM_IMAGES, calibrated=True)
+    pairs = pairs_within(range(NUM_IMAGES), 4)
+    write_features(tmp_path / "run.db", collection, world, verified={pair: true_matches(world, pair) for pair in pairs})
+    task = RefineTask(
+        stored=StageFolder(path=tmp_path / "refined", key="a test"),
+        collection=collection,
+        scenes=(stitched_scene(collection, bent_after(world, LAST_SOUND, 20.0)),),
+        features=tmp_path / "run.db",
+        maps=None,
+        map_pairs=(),
+        parts=(),
+        calibrated=True,
+        threads=1,
+    )
+    (figures,) = refine_scenes(task)
+    assert "images placed again" in [step.name for step in figures.steps if step.kept]
+    assert figures.doubts == ()
+    model = pycolmap.Reconstruction(tmp_path / "refined/0/model")
+    distance, turn = off_by(world, poses_of(model))
+    assert distance < 0.004
+    assert turn < 0.4
+    with pycolmap.Database.open(tmp_path / "refined/database.db") as database:
+        priors = {prior.corr_data_id.id: prior.position for prior in database.read_all_pose_priors()}
+    off = [np.linalg.norm(priors[i + 1] - world.centres[i]) / world.extent for i in range(NUM_IMAGES)]
+    assert max(off) < 0.01, "the places of before do not stay as priors"

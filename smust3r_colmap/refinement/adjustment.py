@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
@@ -120,6 +120,12 @@ class Priors:
 
     centres: Mapping[int, FloatArray]
     sigma: float
+
+    def with_places(self, cam_from_world: Mapping[int, FloatArray]) -> Priors:
+        """With the centres of other (3, 4) poses, by image index, for the images that have a prior."""
+        moved = {index + 1: invert_rigid(pose)[:, 3] for index, pose in cam_from_world.items()}
+        centres = {image_id: moved.get(image_id, centre) for image_id, centre in self.centres.items()}
+        return replace(self, centres=centres)
 
 
 def priors_of(model: pycolmap.Reconstruction) -> Priors:

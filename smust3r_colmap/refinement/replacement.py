@@ -2,10 +2,8 @@
 
 A segment can be bent where few points hold it together: a step straight ahead into the distance, the end of a
 walk. Adjustment does not get out of it, since every bent image sees its own points without error, nor does
-resection, for the points of the bend are few and far. But the verified matches across the bend tell: in a sound model
-nearly all of them lie on their epipolar lines, over a bend a good part does not. So the images that no chain of
-consenting pairs ties to the bulk of the model are mapped anew together with those they match in the bulk, by COLMAP's
-global mapper, which takes the turns from pairs alone. The new places stand where they are tied to the bulk.
+resection, for the points of the bend are few and far. So bent images, see ``bends``, are mapped anew together with
+those they match in the bulk of the model, by COLMAP's global mapper, which takes the turns from pairs alone.
 The next module to read is ``principal_point``.
 """
 
@@ -19,8 +17,6 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.evaluation import compare_trajectories, read_reference_sparse
@@ -28,28 +24,29 @@ from smust3r_colmap.execution import TaskFailure, map_tasks
 from smust3r_colmap.exporters.colmap_database import write_colmap_database
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import FloatArray
-from smust3r_colmap.refinement.adjustment import Tolerance, triangulate
+from smust3r_colmap.refinement.adjustment import ModelFigures, Tolerance, figures_of, triangulate
 from smust3r_colmap.refinement.bench import TIGHT_PART, Bench, cameras_of, poses_of, views_of
+from smust3r_colmap.refinement.bends import SOUND_SHARE, Agreement, bent_images
 from smust3r_colmap.refinement.correspondences import Pair
 from smust3r_colmap.refinement.feature_matches import (
+    MIN_CONSENT,
+    MIN_MATCHES,
     MIN_VERIFIED,
     Consent,
     MatchedFeatures,
     ask_consent,
     consent_shares,
 )
+from smust3r_colmap.refinement.steps import StepReport, movement
 
 logger = logging.getLogger(__name__)
 
-STRONG_MATCHES = 30
-"""Verified matches of a pair that make its word count; COLMAP's own bar for registration."""
-SOUND_SHARE = 0.85
-"""Of a pair's verified matches, on their epipolar lines: sound models of nine collections are tied together by pairs
-above 0.9; a bent street was not."""
+NAME = "images placed again"
 MAX_NEIGHBOURS = 24
 """Images of the bulk that are mapped along, those with most matches first: they say where the others belong."""
 MAX_BENT = 60
 """More is no bend but a model in parts, and more than the global mapper does in passing."""
+_NOT_MAPPED = "{} images are bent, and the global mapper does not tie them to their neighbours"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,57 +55,79 @@ class Replacement:
 
     Args:
         bench: to go on with; the given one, or one with other places, matches and tracks.
-        bent: indices of the images that were found bent.
-        placed: those of them that stand elsewhere now; empty where the new places are no good.
-        share_before, share_after: of the verified matches of the bent images, on their epipolar lines.
+        cam_from_world: (3, 4) of the images that stand elsewhere now, by image index.
+        report: of the step; None where no image is bent.
     """
 
     bench: Bench
-    bent: tuple[int, ...]
-    placed: tuple[int, ...]
-    share_before: float
-    share_after: float
-
-    @property
-    def summary(self) -> str:
-        """In words, for the report."""
-        shares = f"{self.share_before:.0%} of their matches agreed, {self.share_after:.0%} with new places"
-        return f"{len(self.bent)} images were bent: {shares}"
+    cam_from_world: Mapping[int, FloatArray]
+    report: StepReport | None
 
 
 def place_bent_images_again(bench: Bench, features: MatchedFeatures, tolerance: Tolerance) -> Replacement:
-    """Map bent images anew beside the bulk, and keep that if it ties all of them to it.
+    """Map bent images anew beside the bulk, and keep that if more of their matches agree and none are bent any more.
 
     Args:
         bench: adjusted once, with tracks; used up where images were placed.
         features: of the run, with all verified matches.
         tolerance: of the tracks that the images get.
     """
-    poses = poses_of(bench.model)
-    before = _shares(bench, poses, features)
+    poses, figures = poses_of(bench.model), figures_of(bench.model)
+    before = _agreements(bench, poses, features)
     bent = bent_images(before, poses.keys())
-    share_before = _pooled(before, bent, features)
-    unchanged = Replacement(bench=bench, bent=bent, placed=(), share_before=share_before, share_after=share_before)
-    if not bent or len(bent) > MAX_BENT:
-        return unchanged
-    found = _mapped_anew(bench, poses, bent, features)
-    if not found:
-        return unchanged
-    moved = {**poses, **found}
-    after = _shares(bench, moved, features)
-    share_after = _pooled(after, bent, features)
-    if share_after <= share_before or set(bent) & set(bent_images(after, poses.keys())):
-        return replace(unchanged, share_after=share_after)
-    for index in found:
+    if not bent:
+        return Replacement(bench=bench, cam_from_world={}, report=None)
+    found: dict[int, FloatArray] = {}
+    if len(bent) > MAX_BENT:
+        reason = f"{len(bent)} images are bent, and more than {MAX_BENT} are not placed again"
+    else:
+        found = _mapped_anew(bench, poses, bent, features)
+        after = _agreements(bench, {**poses, **found}, features)
+        reason = _why_no_better(before, after, bent, poses.keys()) if found else _NOT_MAPPED.format(len(bent))
+    if reason:
+        return Replacement(bench=bench, cam_from_world={}, report=_report(bench, figures, poses, reason))
+    for index, pose in found.items():
         # Points of the old place go with it.
         frame_id = bench.model.image(index + 1).frame_id
         bench.mapper.observation_manager.deregister_frame(frame_id)
-        bench.model.frame(frame_id).rig_from_world = pycolmap.Rigid3d(moved[index])
+        bench.model.frame(frame_id).rig_from_world = pycolmap.Rigid3d(pose)
         bench.model.register_frame(frame_id)
     bench = bench.with_matches(_consent(bench, features))
     triangulate(bench.mapper, tolerance)
-    return Replacement(
-        bench=bench, bent=bent, placed=tuple(sorted(found)), share_before=share_before, share_after=share_after
+    return Replacement(bench=bench, cam_from_world=found, report=_report(bench, figures, poses, ""))
+
+
+def _why_no_better(
+    before: Mapping[Pair, Agreement], after: Mapping[Pair, Agreement], bent: Collection[int], images: Collection[int]
+) -> str:
+    """In words, or empty where the new places are better.
+
+    More matches must agree than before, and no pair may lose the consent that it had: look-alikes of another
+    place would gain many matches and lose the few true ones.
+    """
+    around = [pair for pair in before if not set(pair).isdisjoint(bent)]
+    agreed, agree = (round(sum(one[p].share * one[p].num_matches for p in around)) for one in (before, after))
+    if agree <= agreed:
+        return f"{len(bent)} images are bent, and of their matches {agree} agree with new places, {agreed} with the old"
+    lost = [p for p in around if before[p].share >= SOUND_SHARE and after[p].share < MIN_CONSENT]
+    if lost:
+        return f"{len(bent)} images are bent, and new places contradict {len(lost)} pairs that agreed with the old"
+    still = set(bent) & set(bent_images(after, images))
+    return f"{len(bent)} images are bent, and {len(still)} of them also in new places" if still else ""
+
+
+def _report(bench: Bench, before: ModelFigures, poses: Mapping[int, FloatArray], reason: str) -> StepReport:
+    old = {bench.model.image(i + 1).frame_id: pycolmap.Rigid3d(pose) for i, pose in poses.items()}
+    moved, turned = movement(bench.model, old)
+    return StepReport(
+        name=NAME,
+        before=before,
+        after=figures_of(bench.model),
+        moved_percent=float(np.median(moved)),
+        max_moved_percent=float(moved.max()),
+        turned_deg=float(np.median(turned)),
+        kept=not reason,
+        reason=reason,
     )
 
 
@@ -194,40 +213,12 @@ def _neighbours(bent: Collection[int], images: Collection[int], features: Matche
     return sorted((i for i in counts if counts[i]), key=lambda i: -counts[i])[:MAX_NEIGHBOURS]
 
 
-def bent_images(shares: Mapping[Pair, float], images: Collection[int]) -> tuple[int, ...]:
-    """Those that no chain of sound pairs ties to the bulk, though pairs speak of them; ascending.
-
-    Args:
-        shares: by pair, the part of its matches that agree with the model.
-        images: indices of all images of the model.
-
-    Returns:
-        Empty, too, where no bulk of more than half of the images is tied together: then nothing can be told.
-    """
-    order = np.array(sorted(images), dtype=np.int64)
-    sound = np.array([pair for pair, share in shares.items() if share >= SOUND_SHARE], dtype=np.int64).reshape(-1, 2)
-    rows, columns = np.searchsorted(order, sound).T
-    ties = csr_array((np.ones(len(sound)), (rows, columns)), shape=(len(order), len(order)))
-    _, group = connected_components(ties, directed=False)
-    bulk = int(np.bincount(group).argmax())
-    if 2 * np.count_nonzero(group == bulk) <= len(order):
-        return ()
-    spoken_of = {index for pair in shares for index in pair}
-    return tuple(int(index) for index in order[group != bulk] if int(index) in spoken_of)
-
-
-def _shares(bench: Bench, poses: Mapping[int, FloatArray], features: MatchedFeatures) -> dict[Pair, float]:
+def _agreements(bench: Bench, poses: Mapping[int, FloatArray], features: MatchedFeatures) -> dict[Pair, Agreement]:
     views = views_of(poses, cameras_of(bench.model, bench.collection.cameras), bench.collection)
-    return consent_shares(features, views, tolerance=TIGHT_PART, min_matches=STRONG_MATCHES)
+    shares = consent_shares(features, views, tolerance=TIGHT_PART, min_matches=MIN_MATCHES)
+    return {pair: Agreement(num_matches=len(features.verified[pair]), share=share) for pair, share in shares.items()}
 
 
 def _consent(bench: Bench, features: MatchedFeatures) -> Consent:
     views = views_of(poses_of(bench.model), cameras_of(bench.model, bench.collection.cameras), bench.collection)
     return ask_consent(features, views, tolerance=TIGHT_PART)
-
-
-def _pooled(shares: Mapping[Pair, float], images: Collection[int], features: MatchedFeatures) -> float:
-    """Share of all verified matches of the images, over their pairs; 1 without any."""
-    counts = {pair: len(features.verified[pair]) for pair in shares if not set(pair).isdisjoint(images)}
-    total = sum(counts.values())
-    return sum(shares[pair] * count for pair, count in counts.items()) / total if total else 1.0

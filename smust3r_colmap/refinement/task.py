@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -64,6 +64,7 @@ from smust3r_colmap.refinement.feature_matches import (
 )
 from smust3r_colmap.refinement.pointmap_matches import MappedView, match_by_pointmaps
 from smust3r_colmap.refinement.principal_point import ask_for_principal_points
+from smust3r_colmap.refinement.replacement import NAME as REPLACEMENT
 from smust3r_colmap.refinement.replacement import place_bent_images_again
 from smust3r_colmap.refinement.steps import MAX_ERROR_PX, StepReport, tried_step
 from smust3r_colmap.run_directory import StageFolder, write_json
@@ -84,7 +85,6 @@ matches hold lets go of them one by one."""
 LARGE = 250
 """Images beyond which parts are adjusted before the whole."""
 STAYED = "kept where it was"
-REPLACEMENT = "images placed again"
 MODEL_FOLDER, DATABASE_FILE = "model", "database.db"
 
 
@@ -134,6 +134,7 @@ class RefinedFigures:
         final: figures of the model as it is stored.
         kept: the refined model stands; False where it came out worse than the stitched one.
         principal_point: what became of it, and why.
+        doubts: what speaks against the model, in words.
         reason: why not, or empty.
     """
 
@@ -146,6 +147,7 @@ class RefinedFigures:
     final: ModelFigures
     kept: bool
     principal_point: str
+    doubts: tuple[str, ...]
     reason: str = ""
 
 
@@ -153,7 +155,11 @@ def refine_scenes(task: RefineTask) -> tuple[RefinedFigures, ...]:
     """Refine all scenes and store their models, the common database and the figures; see ``RefineTask``."""
     features = _gathered(task)
     with task.stored.write() as folder:
-        outcomes = [_refine_scene(task, scene, features, folder) for scene in task.scenes]
+        outcomes: list[_Outcome] = []
+        for scene in task.scenes:
+            elsewhere = {i for other in task.scenes if other is not scene for i in other.image_indices}
+            elsewhere |= {i for outcome in outcomes for i in poses_of(outcome.model)}
+            outcomes.append(_refine_scene(task, scene, _without(elsewhere - {*scene.image_indices}, features), folder))
         if task.complete and outcomes[0].figures.kept:
             outcomes[0] = _completed(task, features, outcomes, folder)
         for number, outcome in enumerate(outcomes):
@@ -216,9 +222,8 @@ def _matched_by_pointmaps(
 # ------------------------------------------------------------------------- one scene
 def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scratch: Path) -> _Outcome:
     cameras = tuple(scene.cameras.get(i, prior) for i, prior in enumerate(task.collection.cameras))
-    of_scene = _without_images_of_other_scenes(features, scene, task.scenes)
     stitched = dict(zip(scene.image_indices, scene.cam_from_world, strict=True))
-    consent = ask_consent(of_scene, views_of(stitched, cameras, task.collection), tolerance=task.tolerance)
+    consent = ask_consent(features, views_of(stitched, cameras, task.collection), tolerance=task.tolerance)
     bench = Bench(task.collection, cameras, consent, stitched, scratch=scratch, threads=task.threads)
     priors = priors_of(bench.model)
     steps = [_triangulation(bench, Tolerance(pixels=task.tolerance * _longer_side(task), angle_deg=LOOSE_ANGLE_DEG))]
@@ -231,20 +236,22 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
 
     tight = Tolerance(pixels=max(TIGHT_PART * _longer_side(task), MIN_TIGHT_PX), angle_deg=TIGHT_ANGLE_DEG)
     poses, cameras = poses_of(bench.model), cameras_of(bench.model, cameras)
-    consent = ask_consent(of_scene, views_of(poses, cameras, task.collection), tolerance=TIGHT_PART)
+    consent = ask_consent(features, views_of(poses, cameras, task.collection), tolerance=TIGHT_PART)
     bench = bench.with_matches(consent)
-    registered = bench.register_missing(of_scene, tight)
+    registered = bench.register_missing(features, tight)
     steps.append(_triangulation(bench, tight, name="longer tracks"))
     bench.drop_needless_pairs()
     steps.append(_adjustment("second adjustment", bench.model, priors, task, SECOND_ITERATIONS, rough=True))
     bench.filter(MAX_ERROR_PX)
-    replacement = place_bent_images_again(bench, of_scene, tight)
-    bench = replacement.bench
-    if replacement.placed:
-        steps.append(_adjustment(REPLACEMENT, bench.model, priors, task, SECOND_ITERATIONS, rough=True))
+    replacement = place_bent_images_again(bench, features, tight)
+    if replacement.report:
+        steps.append(replacement.report)
+    if replacement.cam_from_world:
+        # Where they were says nothing any more: not for the adjustment, and not where they turn out weak.
+        bench, stitched = replacement.bench, {**stitched, **replacement.cam_from_world}
+        priors = priors.with_places(replacement.cam_from_world)
+        steps.append(_adjustment("adjustment around them", bench.model, priors, task, SECOND_ITERATIONS, rough=True))
         bench.filter(MAX_ERROR_PX)
-    elif replacement.bent:
-        steps.append(_unchanged(REPLACEMENT, bench.model, replacement.summary))
     why_not = _why_principal_points_stay(bench.model, priors, task)
     if not why_not:
         moved = _adjustment("principal point", bench.model, priors, task, SECOND_ITERATIONS, principal_point=True)
@@ -262,20 +269,6 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
         if last.max_moved_percent < STILL_PERCENT or not last.kept:
             break
     return _finished(task, bench, priors, stitched, steps, registered, principal_point)
-
-
-def _unchanged(name: str, model: pycolmap.Reconstruction, reason: str) -> StepReport:
-    figures = figures_of(model)
-    return StepReport(
-        name=name,
-        before=figures,
-        after=figures,
-        moved_percent=0.0,
-        max_moved_percent=0.0,
-        turned_deg=0.0,
-        kept=False,
-        reason=reason,
-    )
 
 
 def _triangulation(bench: Bench, tolerance: Tolerance, *, name: str = "triangulation") -> StepReport:
@@ -343,6 +336,7 @@ def _nothing_to_adjust(bench: Bench, priors: Priors, steps: list[StepReport]) ->
         final=figures_of(bench.model),
         kept=False,
         principal_point=STAYED,
+        doubts=(),
         reason=reason,
     )
     return _Outcome(model=bench.model, consent=bench.consent, priors=priors, figures=figures)
@@ -375,9 +369,19 @@ def _finished(
         final=figures_of(model),
         kept=some_sound,
         principal_point=principal_point,
+        doubts=_doubts(steps),
         reason="" if some_sound else "no image sees enough points to be adjusted by",
     )
     return _Outcome(model=model, consent=bench.consent, priors=priors, figures=figures)
+
+
+def _doubts(steps: Sequence[StepReport]) -> tuple[str, ...]:
+    """No adjustment stood, or images stay bent."""
+    adjustments = [step for step in steps if "adjustment" in step.name]
+    doubts = [step.reason for step in steps if step.name == REPLACEMENT and not step.kept]
+    if adjustments and not any(step.kept for step in adjustments):
+        doubts.append(f"no adjustment stood: {adjustments[-1].reason}")
+    return tuple(doubts)
 
 
 def _completed(task: RefineTask, features: MatchedFeatures, outcomes: Sequence[_Outcome], scratch: Path) -> _Outcome:
@@ -475,14 +479,11 @@ def _longer_side(task: RefineTask) -> int:
     return int(np.median([max(image.width, image.height) for image in task.collection.images]))
 
 
-def _without_images_of_other_scenes(
-    features: MatchedFeatures, scene: Scene, scenes: Iterable[Scene]
-) -> MatchedFeatures:
+def _without(elsewhere: Collection[int], features: MatchedFeatures) -> MatchedFeatures:
     """Images that another scene holds are not to be placed in this one, too."""
-    elsewhere = {i for other in scenes if other is not scene for i in other.image_indices} - set(scene.image_indices)
 
     def kept(matches: Mapping[Pair, npt.NDArray[np.uint32]]) -> dict[Pair, npt.NDArray[np.uint32]]:
-        return {pair: rows for pair, rows in matches.items() if not elsewhere & set(pair)}
+        return {pair: rows for pair, rows in matches.items() if set(pair).isdisjoint(elsewhere)}
 
     return replace(features, raw=kept(features.raw), verified=kept(features.verified))
 
