@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from smust3r_colmap.config import ImportConfig
 from smust3r_colmap.errors import ConfigError, InputError
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.colmap_model import MIN_IMAGES, ForeignModel, SurfacePoints
@@ -122,8 +123,8 @@ def fit_to_images(
             pinholes into SIMPLE_RADIAL, since most of them are guesses and photographs are distorted.
         calibrated: the cameras are known; they are brought to the size of the files and otherwise stay.
         complete: files that the model has no image of join the collection, without a pose. Each has the camera of
-            files like it; where there are none, a camera of its own that starts from EXIF or COLMAP's guess, unless
-            the cameras are known: then it is left out.
+            files like it; where there are none, a camera of its own that starts from EXIF or COLMAP's guess, in the
+            model that a run of ours takes, unless the cameras are known: then it is left out.
 
     Raises:
         InputError: a name fits several files, two images fit one file, fewer than two images have a file, or the
@@ -153,9 +154,12 @@ def fit_to_images(
     others = [*model.unposed, *rejected]
     if complete:
         owned = list(zip(files, camera_of, strict=True))
-        cameras, owned_by_others, without_camera = _cameras_of_others(unused, owned, cameras, camera_model, calibrated)
+        guessed_model = camera_model or ImportConfig.camera_model
+        cameras, owned_by_others, without_camera = _cameras_of_others(
+            unused, owned, cameras, guessed_model, calibrated, remarks
+        )
         files, camera_of = [*files, *owned_by_others], (*camera_of, *owned_by_others.values())
-        others = [one for one in others if one.name not in {file.name for file in owned_by_others}] + without_camera
+        others = [*_of_no_file(model.unposed, unused), *rejected, *without_camera]
     _remark_on_unused([] if complete else unused, remarks)
     images = tuple(
         SourceImage(
@@ -247,6 +251,16 @@ def _match_files(
         )
     unused = sorted(usable.keys() - found.values(), key=natural_key)
     return matched, [usable[name] for name in unused], rejected
+
+
+def _of_no_file(images: Iterable[RejectedImage], files: Iterable[_File]) -> list[RejectedImage]:
+    """The images that are none of the files, however their names are spelled."""
+    left, names = list(images), [file.name for file in files]
+    for spelling in _SPELLINGS.values():
+        found = {spelling(one.name) for one in left} & {spelling(name) for name in names}
+        left = [one for one in left if spelling(one.name) not in found]
+        names = [name for name in names if spelling(name) not in found]
+    return left
 
 
 def _remark_on_unused(unused: Sequence[_File], remarks: list[str]) -> None:
@@ -373,10 +387,14 @@ def _cameras_of_others(
     others: Sequence[_File],
     owned: Sequence[tuple[_File, int]],
     cameras: tuple[Intrinsics, ...],
-    camera_model: str,
+    guessed_model: str,
     calibrated: bool,
+    remarks: list[str],
 ) -> tuple[tuple[Intrinsics, ...], dict[_File, int], list[RejectedImage]]:
-    """All cameras, the number of the camera of each further file, and the files that are left out for want of one."""
+    """All cameras, the number of the camera of each further file, and the files that are left out for want of one.
+
+    A guess has ``guessed_model``, for what the model's cameras have is of another lens and may be a fisheye.
+    """
     number_of: dict[Hashable, int] = {}
     for source in dict.fromkeys(file.source for file, _ in owned):
         number_of[source] = Counter(camera for file, camera in owned if file.source == source).most_common(1)[0][0]
@@ -388,8 +406,14 @@ def _cameras_of_others(
         if file.source not in number_of:
             number_of[file.source] = len(grown)
             alike = [other.photo for other in others if other.source == file.source]
-            grown.append(shared_prior(alike, camera_model or cameras[0].model))
+            grown.append(shared_prior(alike, guessed_model))
         camera_of[file] = number_of[file.source]
+    if guesses := len(grown) - len(cameras):
+        count = sum(camera >= len(cameras) for camera in camera_of.values())
+        remarks.append(
+            f"{guesses} cameras were guessed as {guessed_model}, from EXIF or the image size, for {count} images like "
+            "none of the model"
+        )
     return tuple(grown), camera_of, rejected
 
 

@@ -123,9 +123,28 @@ def check_output_not_inside(images: Path, output: Path) -> None:
     Raises:
         ConfigError: the output folder is the image folder or lies in it.
     """
-    inside, outside = output.resolve(), images.resolve()
-    if inside == outside or outside in inside.parents:
+    if _lies_in(images, output):
         raise ConfigError(f"the output folder {output} lies inside the image folder {images}; choose one beside it")
+
+
+def check_masks_not_inside(images: Path, masks: str) -> None:
+    """Refuse masks among the images: they would be read as photographs, or photographs as masks.
+
+    Args:
+        masks: the folder, as the setting names it; empty for none.
+
+    Raises:
+        ConfigError: the folder of masks is the image folder or lies in it.
+    """
+    if masks and _lies_in(images, Path(masks)):
+        raise ConfigError(
+            f"--masks {masks}: lies inside the image folder {images}, where masks and photographs are taken for each "
+            "other; move the masks beside it"
+        )
+
+
+def _lies_in(outer: Path, inner: Path) -> bool:
+    return inner.resolve() == outer.resolve() or outer.resolve() in inner.resolve().parents
 
 
 # --------------------------------------------------------------------------------- scan

@@ -1,30 +1,40 @@
 """Masks of images: which pixels no feature, no depth and no trainer shall use.
 
-The rule is COLMAP's: the mask of an image is ``<name>.png`` below the folder of masks, else ``<name without
-suffix>.png``; what is black in it is left out, everything else is kept. A mask has the size of the upright image. An
-image without a mask is used as a whole. The next module to read is ``masked_maps``, which applies masks to depth.
+Names are COLMAP's: the mask of an image is ``<name>.png`` below the folder of masks, else ``<name without
+suffix>.png``; what is black in it is left out, everything else is kept. An image without a mask is used as a whole
+(COLMAP's feature extraction passes over it). A mask has the size of the upright image, as its pixels are stored: what
+its own EXIF says of turning is not looked at. The next module to read is ``masked_maps``, which applies masks to depth.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-from PIL import Image, UnidentifiedImageError
 
 from smust3r_colmap.errors import ImageError, InputError
+from smust3r_colmap.importers.images import stored_size
 from smust3r_colmap.products import ImageCollection, ImageMask, SourceImage
 
 UInt8Array = npt.NDArray[np.uint8]
 
-_DAMAGE = (OSError, SyntaxError, ValueError, UnidentifiedImageError, Image.DecompressionBombError)
-"""What Pillow raises on files that are no image, or half of one."""
+
+@dataclass(frozen=True, kw_only=True)
+class MaskSet:
+    """The masks that a run was made with.
+
+    Args:
+        folder: where they lie.
+        digest_of: hash of the content of each mask, by the name of its image.
+    """
+
+    folder: Path
+    digest_of: Mapping[str, str]
 
 
 def with_masks(collection: ImageCollection, folder: Path) -> ImageCollection:
@@ -35,7 +45,7 @@ def with_masks(collection: ImageCollection, folder: Path) -> ImageCollection:
 
     Raises:
         InputError: there is no such folder, or no image has a mask in it.
-        ImageError: a mask cannot be read, or has another size than its image.
+        ImageError: a mask cannot be read, has another size than its image, or is itself one of the images.
     """
     if not folder.is_dir():
         raise InputError(f"--masks {folder}: there is no such folder of masks")
@@ -46,7 +56,37 @@ def with_masks(collection: ImageCollection, folder: Path) -> ImageCollection:
             f"--masks {folder}: none of the {len(images)} images has a mask there; the mask of {name} is {name}.png "
             f"or {PurePosixPath(name).with_suffix('.png')}"
         )
+    _refuse_photographs(images)
     return replace(collection, images=images)
+
+
+def masks_of(collection: ImageCollection, folder: str) -> MaskSet | None:
+    """What ``with_masks`` found in ``folder``, to be kept with the results; None where no folder is named."""
+    if not folder:
+        return None
+    digests = {image.name: image.mask.digest for image in collection.images if image.mask is not None}
+    return MaskSet(folder=Path(folder), digest_of=digests)
+
+
+def check_masks(masks: MaskSet, names: Iterable[str]) -> None:
+    """Refuse masks that are not those of the run: they would make another result of it without a word.
+
+    Args:
+        names: of the images whose masks are needed.
+
+    Raises:
+        InputError: the folder is gone.
+        ImageError: a mask is gone, is another one now, or was not there before.
+    """
+    way_out = "put the old masks back, or name a folder with --masks, whose masks are then taken as they are"
+    if not masks.folder.is_dir():
+        raise InputError(f"{masks.folder}: the masks of the run are not there any more; {way_out}")
+    for name in names:
+        path = find_mask(masks.folder, name)
+        then, now = masks.digest_of.get(name, ""), "" if path is None else _digest(_read(path))
+        if then != now:
+            what = "has changed" if then and now else "is gone" if then else "is new"
+            raise ImageError(f"{path or masks.folder}: the mask of {name} {what} since the run; {way_out}")
 
 
 def names_without_mask(images: Iterable[SourceImage]) -> tuple[str, ...]:
@@ -64,14 +104,13 @@ def load_mask(path: Path, image: SourceImage) -> UInt8Array:
     """(H, W) of the upright image, 255 where it is kept and 0 where it is not.
 
     Raises:
-        ImageError: the file is gone, does not decode, or has another size than the image.
+        ImageError: the file is gone, does not decode, has another size than the image, or is the image itself.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
+    if path.resolve() == image.path.resolve():
+        raise _is_photograph(path, image.name)
     # Grey with the depth of the file: at 8 bits the small numbers of 16-bit labels would become black.
-    mask = cv2.imdecode(np.frombuffer(data or b"\0", np.uint8), cv2.IMREAD_ANYDEPTH)
+    stored = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    mask = cv2.imdecode(np.frombuffer(_read(path) or b"\0", np.uint8), stored)
     if mask is None:
         raise _no_image(path)
     _check_size(path, (mask.shape[1], mask.shape[0]), image)
@@ -82,18 +121,32 @@ def _with_mask(image: SourceImage, folder: Path) -> SourceImage:
     path = find_mask(folder, image.name)
     if path is None:
         return image
+    data = _read(path)
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
-    try:
-        with Image.open(io.BytesIO(data)) as head:
-            size = head.size
-            head.verify()
-    except _DAMAGE as error:
+        size = stored_size(data)
+    except ImageError as error:
         raise _no_image(path) from error
     _check_size(path, size, image)
-    return replace(image, mask=ImageMask(path=path, digest=hashlib.blake2b(data, digest_size=20).hexdigest()))
+    return replace(image, mask=ImageMask(path=path, digest=_digest(data)))
+
+
+def _refuse_photographs(images: Sequence[SourceImage]) -> None:
+    """By content, so that links and copies of the image folder are found, too."""
+    name_of = {image.digest: image.name for image in images}
+    for image in images:
+        if image.mask is not None and image.mask.digest in name_of:
+            raise _is_photograph(image.mask.path, name_of[image.mask.digest])
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.blake2b(data, digest_size=20).hexdigest()
 
 
 def _check_size(path: Path, size: tuple[int, int], image: SourceImage) -> None:
@@ -102,6 +155,13 @@ def _check_size(path: Path, size: tuple[int, int], image: SourceImage) -> None:
             f"{path}: the mask is {size[0]}x{size[1]} px and its image {image.width}x{image.height};"
             " masks have the size of the original image, upright"
         )
+
+
+def _is_photograph(path: Path, name: str) -> ImageError:
+    return ImageError(
+        f"{path}: would be a mask and is the photograph {name}, too; keep masks in a folder of their own, beside the "
+        "images"
+    )
 
 
 def _no_image(path: Path) -> ImageError:

@@ -53,13 +53,15 @@ class Comparison:
         name: of the image.
         num_true: pixels with a reading of the sensor.
         ratios: (P,) depth of the map over that of the sensor, at the pixels that have both.
-        point_ratios: (Q,) the same of the sparse points.
+        point_ratios: (Q,) the same of the sparse points, of those before the camera.
+        num_behind: points that the image observes and that lie behind it, where no depth is right.
     """
 
     name: str
     num_true: int
     ratios: FloatArray
     point_ratios: FloatArray
+    num_behind: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +94,7 @@ class Judgement:
         registration: between sensor and colour camera.
         scale_of_depth, scale_of_cameras: metres per unit of the model.
         overall: at the scale of depth. at_scale_of_cameras: at the other. points: of sparse points, at that of depth.
+        num_behind: observed points that lie behind their camera and are in no figure.
         images: each image at the scale of depth.
     """
 
@@ -101,6 +104,7 @@ class Judgement:
     overall: Figures
     at_scale_of_cameras: Figures
     points: Figures
+    num_behind: int
     images: tuple[Figures, ...]
 
 
@@ -153,6 +157,7 @@ def judge(run: Path, data: Path, *, registration: str) -> Judgement:
         overall=pooled("all images", comparisons, scale),
         at_scale_of_cameras=pooled("at the cameras' scale", comparisons, scale_of_cameras),
         points=figures("sparse points", np.concatenate([one.point_ratios for one in comparisons]) * scale, None),
+        num_behind=sum(one.num_behind for one in comparisons),
         images=tuple(pooled(one.name, [one], scale) for one in comparisons),
     )
 
@@ -225,11 +230,13 @@ def compare(
         else:
             num_maps += 1
         truth = depth_in_view(sensor.depth(k), sensor.intrinsics, view_from_sensor, camera)
+        ratios_of_points, num_behind = point_ratios(model, image, truth)
         yield Comparison(
             name=image.name,
             num_true=int((truth > 0).sum()),
             ratios=map_ratios(depth, truth),
-            point_ratios=point_ratios(model, image, truth),
+            point_ratios=ratios_of_points,
+            num_behind=num_behind,
         )
     if not num_maps:
         raise InputError(f"{workspace / 'stereo/depth_maps'}: has no map of the {len(seen)} images with a reading")
@@ -261,18 +268,21 @@ def map_ratios(depth: FloatMap, truth: FloatMap) -> FloatArray:
     return ratios
 
 
-def point_ratios(model: pycolmap.Reconstruction, image: pycolmap.Image, truth: FloatMap) -> FloatArray:
-    """(Q,) depth of the points that an image observes, over the truth (H, W) in their pixel, where there is any."""
+def point_ratios(model: pycolmap.Reconstruction, image: pycolmap.Image, truth: FloatMap) -> tuple[FloatArray, int]:
+    """(Q,) depth of the points that an image observes, over the truth (H, W) in their pixel, where there is any.
+
+    Points that are not before the camera are left out and counted: their ratio means nothing.
+    """
     observed = [(*point.xy, *model.point3D(point.point3D_id).xyz) for point in image.points2D if point.has_point3D()]
     table = np.array(observed, dtype=np.float64).reshape(-1, 5)
     cam_from_world = np.asarray(image.cam_from_world().matrix())
     z = table[:, 2:] @ cam_from_world[2, :3] + cam_from_world[2, 3]
     columns, rows = np.floor(table[:, :2]).astype(int).T
     height, width = truth.shape
-    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    inside = (z > 0) & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     there = truth[rows[inside], columns[inside]].astype(np.float64)
     ratios: FloatArray = z[inside][there > 0] / there[there > 0]
-    return ratios
+    return ratios, int((z <= 0).sum())
 
 
 def scale_of_depth(comparisons: Sequence[Comparison]) -> float:
@@ -295,7 +305,7 @@ def pooled(what: str, comparisons: Sequence[Comparison], scale: float) -> Figure
 
 
 def figures(what: str, ratios: FloatArray, num_true: int | None) -> Figures:
-    """Of ratios (P,) after the scale, which are 1 where depth is right; ``num_true`` None for no coverage.
+    """Of ratios (P,) above 0, after the scale, 1 where depth is right; ``num_true`` None for no coverage.
 
     Source: Eigen et al. 2014, section 4.2, for the measures of depth; 1.05 and 1.25 are thresholds of their delta.
     """
@@ -338,7 +348,8 @@ def render_table(judgement: Judgement) -> str:
         f"metres per unit of the model: {judgement.scale_of_depth:.5g} by depth, "
         f"{judgement.scale_of_cameras:.5g} by the cameras; registration {judgement.registration}"
     )
-    return "\n".join([*table, scales])
+    behind = [f"{judgement.num_behind} observed points lie behind their camera and are in no figure"]
+    return "\n".join([*table, *(behind if judgement.num_behind else []), scales])
 
 
 def cell(share: float) -> str:

@@ -21,7 +21,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
@@ -85,7 +85,10 @@ def parse_arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("data", type=Path, help="data set with images/, depth/, poses.txt and intrinsics.txt")
     parser.add_argument("output", type=Path, metavar="OUT", help="folder of the run; made when missing")
     parser.add_argument(
-        "--images", type=Path, metavar="FILE", help=f"names of the images to take (DATA/{SUBSET_FILE}, or else all)"
+        "--images",
+        type=Path,
+        metavar="FILE",
+        help=f"names of the images to take, one a line (DATA/{SUBSET_FILE}, or else all)",
     )
     parser.add_argument(
         "--preset", choices=sorted(PRESETS), default="network", help="errors of the oracle (%(default)s)"
@@ -107,9 +110,10 @@ def chosen_images(data: Path, list_file: Path | None, output: Path) -> Path:
     if list_file is None and not subset.exists():
         return data / "images"
     try:
-        names = subset.read_text(encoding="utf-8").split()
+        lines = subset.read_text(encoding="utf-8").splitlines()
     except (OSError, ValueError) as error:
         raise InputError(f"{subset}: needed a text file with names of images: {error}") from error
+    names = [line.strip() for line in lines if line.strip()]
     links = output.resolve().with_name(f"{output.resolve().name}_images")
     with storage_errors(links):
         link_images(data / "images", names, links)
@@ -119,22 +123,33 @@ def chosen_images(data: Path, list_file: Path | None, output: Path) -> Path:
 def link_images(images: Path, names: Sequence[str], links: Path) -> None:
     """Fill a folder with links to the named images, new or from an earlier start.
 
+    Args:
+        names: paths below ``images``, with forward slashes; subfolders are made.
+
     Raises:
-        InputError: an image is missing, or the folder has something else in it.
+        InputError: an image is missing or not below ``images``, or the folder has something else in it.
     """
-    there = {path.name for path in images.iterdir()} if images.is_dir() else set()
-    if missing := [name for name in names if name not in there]:
+    if outside := [name for name in names if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts]:
+        raise InputError(f"{images}: {outside[0]} does not lie in it; names are paths below that folder")
+    if missing := [name for name in names if not (images / name).is_file()]:
         raise InputError(f"{images}: {len(missing)} of {len(names)} images are missing, the first is {missing[0]}")
     links.mkdir(parents=True, exist_ok=True)
-    others = sorted(path.name for path in links.iterdir() if path.name not in names or not path.is_symlink())
+    there = {path.relative_to(links).as_posix(): path for path in links.rglob("*") if not is_plain_folder(path)}
+    others = sorted(name for name, path in there.items() if name not in names or not path.is_symlink())
     if others:
         raise InputError(
             f"{links}: has {len(others)} files besides links to the {len(names)} images, such as {others[0]}; "
             "delete the folder or name another OUT"
         )
     for name in names:
+        (links / name).parent.mkdir(parents=True, exist_ok=True)
         (links / name).unlink(missing_ok=True)  # it may lead to another data set
         (links / name).symlink_to((images / name).resolve())
+
+
+def is_plain_folder(path: Path) -> bool:
+    """A real folder, and no link to one."""
+    return path.is_dir() and not path.is_symlink()
 
 
 # ------------------------------------------------------------------------------- oracle

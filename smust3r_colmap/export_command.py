@@ -82,7 +82,7 @@ def run_export(command: Export, reporter: Reporter) -> int:
     check_is_finished(command.run)
     with RunDirectory(command.run) as run:
         finished = open_finished(run, images=command.images, output=command.output)
-        _check_before(run, finished, names)
+        _check_before(run, finished, names, settings)
         for name in names:
             with reporter.stage(name, total=1) as stage:
                 written = FORMATS[name].write(finished, settings)
@@ -108,15 +108,17 @@ def _settings(command: Export) -> FormatSettings:
     )
 
 
-def _check_before(run: RunDirectory, finished: FinishedRun, names: Sequence[str]) -> None:
+def _check_before(run: RunDirectory, finished: FinishedRun, names: Sequence[str], settings: FormatSettings) -> None:
     """Whatever can be refused before the first format is written."""
     from smust3r_colmap.exports import FORMATS  # noqa: PLC0415  (as above)
-    from smust3r_colmap.finished_run import check_images  # noqa: PLC0415
+    from smust3r_colmap.finished_run import check_images, check_masks_of_run  # noqa: PLC0415
     from smust3r_colmap.importers.image_folder import check_output_not_inside  # noqa: PLC0415
 
     if any(FORMATS[name].reads_images for name in names):
         check_images(run, finished)
         check_output_not_inside(finished.images, finished.output)
+    if settings.masks is None and any(FORMATS[name].reads_masks for name in names):
+        check_masks_of_run(finished)
     if finished.output.resolve() == run.root.resolve():
         return
     if finished.output.exists() and not finished.output.is_dir():

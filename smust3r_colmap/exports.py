@@ -82,12 +82,14 @@ class Format:
         result: the file or folder in the output folder that it makes or replaces.
         about: a line for people.
         reads_images: the original images are needed.
+        reads_masks: the masks of the run are needed, where it had any and no others are named.
     """
 
     write: Callable[[FinishedRun, FormatSettings], Written]
     result: str
     about: str
     reads_images: bool = False
+    reads_masks: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,7 +182,7 @@ def write_trainer(finished: FinishedRun, settings: FormatSettings) -> Written:
         maps=finished.maps,
         cloud=finished.scenes[0].points,
         scales=settings.trainer_scales,
-        masks=settings.masks or finished.masks,
+        masks=settings.masks or (None if finished.masks is None else finished.masks.folder),
         keep_outliers=settings.keep_outliers,
     )
     left_out = report.left_out
@@ -250,6 +252,7 @@ FORMATS: Mapping[str, Format] = {
         result=TRAINER_FOLDER,
         about="folder for splat and NeRF trainers: undistorted images, model, depth",
         reads_images=True,
+        reads_masks=True,
     ),
     "dense": Format(
         write=write_dense,

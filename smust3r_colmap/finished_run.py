@@ -7,12 +7,14 @@ stand, says which of it belongs together. The next module to read is ``exports``
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from smust3r_colmap.errors import CollectionError, ImageError, InputError, RunDirectoryError
 from smust3r_colmap.importers.image_folder import ImportRecord
+from smust3r_colmap.importers.masks import MaskSet, check_masks
 from smust3r_colmap.products import DepthMaps, Scene
 from smust3r_colmap.refinement.task import DATABASE_FILE, MODEL_FOLDER
 from smust3r_colmap.run_directory import RunDirectory, read_json, storage_errors, write_json
@@ -35,7 +37,7 @@ class FinishedRun:
         models: one per scene, folder of the COLMAP model with tracks, or None where there are none.
         database: that goes with the models, or None.
         maps: depth of the images, or None.
-        masks: folder of the masks that the run was made with, or None.
+        masks: those that the run was made with, or None.
     """
 
     output: Path
@@ -45,7 +47,7 @@ class FinishedRun:
     models: tuple[Path | None, ...]
     database: Path | None
     maps: DepthMaps | None
-    masks: Path | None = None
+    masks: MaskSet | None = None
 
     def sparse_model(self, number: int) -> Path:
         """Where the COLMAP model number ``number`` goes."""
@@ -58,7 +60,7 @@ def write_finished(run: RunDirectory, finished: FinishedRun) -> None:
         "images": str(finished.images.resolve()),
         "with_tracks": [model is not None for model in finished.models],
         "with_maps": finished.maps is not None,
-        "masks": None if finished.masks is None else str(finished.masks.resolve()),
+        "masks": None if finished.masks is None else _masks_to_json(finished.masks),
     }
     write_json(run.work / FINISHED_FILE, facts)
 
@@ -98,11 +100,11 @@ def open_finished(run: RunDirectory, *, images: Path | None = None, output: Path
     facts = read_json(run.work / FINISHED_FILE)
     try:
         images_then, with_tracks, with_maps = Path(facts["images"]), facts["with_tracks"], facts["with_maps"]
-    except (KeyError, TypeError) as error:
+        masks = _masks_from_json(facts.get("masks"))
+    except (KeyError, TypeError, AttributeError) as error:
         raise RunDirectoryError(
             f"{run.work / FINISHED_FILE}: was written by another version; start the same reconstruct command again"
         ) from error
-    masks = facts.get("masks")
     refined = run.work / REFINED_STAGE
     return FinishedRun(
         output=run.root if output is None else output,
@@ -112,11 +114,19 @@ def open_finished(run: RunDirectory, *, images: Path | None = None, output: Path
         models=tuple(refined / str(k) / MODEL_FOLDER if has else None for k, has in enumerate(with_tracks)),
         database=refined / DATABASE_FILE if any(with_tracks) else None,
         maps=StoredDepthMaps(run.work / STITCHED_STAGE) if with_maps else None,
-        masks=None if masks is None else Path(masks),
+        masks=masks,
     )
 
 
-# ------------------------------------------------------------------------------ images
+def _masks_to_json(masks: MaskSet) -> dict[str, Any]:
+    return {"folder": str(masks.folder.resolve()), "digests": dict(masks.digest_of)}
+
+
+def _masks_from_json(facts: Mapping[str, Any] | None) -> MaskSet | None:
+    return None if facts is None else MaskSet(folder=Path(facts["folder"]), digest_of=dict(facts["digests"]))
+
+
+# -------------------------------------------------------------------- images and masks
 def check_images(run: RunDirectory, finished: FinishedRun) -> None:
     """Refuse images that are not those the run was made of: their pixels would not fit its cameras.
 
@@ -132,6 +142,16 @@ def check_images(run: RunDirectory, finished: FinishedRun) -> None:
     known = {record.name: record for record in map(ImportRecord.from_json, stored)}
     for name in _names(finished.scenes):
         _check_image(finished.images / name, known[name])
+
+
+def check_masks_of_run(finished: FinishedRun) -> None:
+    """Refuse masks that are not those the run was made with, for formats that take them along.
+
+    Raises:
+        InputError, ImageError: as ``check_masks``; the message names ``--masks``.
+    """
+    if finished.masks is not None:
+        check_masks(finished.masks, _names(finished.scenes))
 
 
 def _names(scenes: Iterable[Scene]) -> list[str]:

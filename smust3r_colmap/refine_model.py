@@ -21,6 +21,7 @@ import numpy.typing as npt
 import pycolmap
 
 from smust3r_colmap.alignment.from_poses import align_poses
+from smust3r_colmap.alignment.irls import evenly_chosen
 from smust3r_colmap.backbones.classical.features import match_pairs
 from smust3r_colmap.backbones.classical.run_features import describe_images, features_of_run
 from smust3r_colmap.config import RunConfig
@@ -36,9 +37,10 @@ from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.importers.colmap_model import ForeignModel, read_colmap_model
 from smust3r_colmap.importers.fitted_model import FittedModel, fit_to_images
-from smust3r_colmap.importers.image_folder import check_output_not_inside
+from smust3r_colmap.importers.image_folder import check_masks_not_inside, check_output_not_inside
+from smust3r_colmap.importers.masks import masks_of
 from smust3r_colmap.pipeline import masked_as_wanted, refinement_summaries
-from smust3r_colmap.products import FloatArray, PointCloud, RunFeatures, Scene, SegmentPiece
+from smust3r_colmap.products import FloatArray, ImageCollection, IntArray, PointCloud, RunFeatures, Scene, SegmentPiece
 from smust3r_colmap.progress import Reporter
 from smust3r_colmap.refinement.correspondences import Pair
 from smust3r_colmap.refinement.refine import Refinement, refine, surfaces_of_clouds
@@ -51,6 +53,10 @@ from smust3r_colmap.summary import GraphSummary, ImageRemark, ModelSummary, RunS
 
 MAX_TURN_DEG = 60.0
 """Of two cameras without points between them: what one sees straight ahead is beyond the edge of the other."""
+
+MAX_ALIGNED = 500
+"""Cameras that say how all have moved as a whole; the alignment compares every two of them, which takes 3.6 GB of
+5,000, and no similarity is better known by more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +98,7 @@ def refine_model(
         RunDirectoryError: the output folder cannot be used, is held by another run, or the disk refused.
     """
     check_output_not_inside(images, output)
+    check_masks_not_inside(images, config.importing.masks)
     foreign = read_colmap_model(model)
     _refuse_to_overwrite(foreign.folder, output)
     with RunDirectory(output, fresh=fresh) as run:
@@ -103,8 +110,8 @@ def refine_model(
         refinement = _refine(fitted, start, features, config, run, clock, tolerance=pose_tolerance)
         _doubt_the_poses(refinement, clock)
         result = _with_points(fitted, start, refinement)
-        outputs = _export(result, start, refinement, images, config, run, clock)
-        summary = _summarise(fitted, result, refinement, outputs, run, clock)
+        outputs = _export(result, start, refinement, images, fitted, config, run, clock)
+        summary = _summarise(fitted, result, features, refinement, outputs, run, clock)
         write_json(run.root / "summary.json", {**summary.to_json_dict(), "model_remarks": fitted.remarks})
     return summary
 
@@ -271,19 +278,21 @@ def refined_from_start(start: Scene, refined: Scene, depth: float) -> Transform:
         start, refined: the first has no image that the second lacks.
         depth: usual depth of the scene in the world of ``refined``.
     """
+    before = _cameras_as_piece(start, evenly_chosen(len(start), MAX_ALIGNED))
+    after = _cameras_as_piece(refined, np.arange(len(refined)))
     try:
-        return align_poses(_cameras_as_piece(refined), _cameras_as_piece(start), depth_target=depth).estimate.b_from_a
+        return align_poses(after, before, depth_target=depth).estimate.b_from_a
     except DegenerateAlignmentError:  # the camera only turned: the priors have kept the world where it was
         return Sim3.identity()
 
 
-def _cameras_as_piece(scene: Scene) -> SegmentPiece:
+def _cameras_as_piece(scene: Scene, chosen: IntArray) -> SegmentPiece:
     return SegmentPiece(
         segment=0,
         piece=0,
-        images=scene.image_indices,
-        seg_from_cam=invert_rigid(scene.cam_from_world),
-        intrinsics=tuple(scene.cameras[camera] for camera in scene.camera_indices),
+        images=tuple(scene.image_indices[k] for k in chosen),
+        seg_from_cam=invert_rigid(scene.cam_from_world[chosen]),
+        intrinsics=tuple(scene.cameras[scene.camera_indices[k]] for k in chosen),
         method="refinement",
         reprojection_error_px=np.nan,
         tracks=None,
@@ -301,6 +310,7 @@ def _export(
     start: Scene,
     refinement: Refinement,
     images: Path,
+    fitted: FittedModel,
     config: RunConfig,
     run: RunDirectory,
     clock: StageClock,
@@ -318,7 +328,7 @@ def _export(
         models=refinement.models,
         database=refinement.database if has_tracks else None,
         maps=None,
-        masks=Path(config.importing.masks) if config.importing.masks else None,
+        masks=masks_of(fitted.collection, config.importing.masks),
     )
     settings = FormatSettings.of(config.output)
     with clock.stage("export", total=1) as stage:
@@ -335,6 +345,7 @@ def _export(
 def _summarise(
     fitted: FittedModel,
     result: Scene,
+    features: RunFeatures,
     refinement: Refinement,
     outputs: Outputs,
     run: RunDirectory,
@@ -355,11 +366,7 @@ def _summarise(
             ),
         ),
         rejected=tuple(ImageRemark(name=one.name, reason=one.reason) for one in fitted.collection.rejected),
-        unregistered=tuple(
-            ImageRemark(name=image.name, reason="no place was found that its matches agree with")
-            for index, image in enumerate(fitted.collection.images)
-            if index not in result.image_indices
-        ),
+        unregistered=_unplaced(fitted.collection, result, features, refined=any(refinement.models)),
         stages=tuple(clock.stages),
         segments=(),
         edges=(),
@@ -380,6 +387,28 @@ def _summarise(
         missing_outputs=outputs.missing,
         remarks=(*_remarks_on_points(fitted, refinement), *outputs.remarks),
     )
+
+
+def _unplaced(
+    collection: ImageCollection, result: Scene, features: RunFeatures, *, refined: bool
+) -> tuple[ImageRemark, ...]:
+    """The images without a pose, and why they have none."""
+    unreadable = {one.name: one.reason for one in features.rejected}
+    placed, remarks = set(result.image_indices), []
+    with pycolmap.Database.open(features.database) as database:
+        for index, image in enumerate(collection.images):
+            if index in placed:
+                continue
+            if image.name in unreadable:
+                reason = unreadable[image.name]
+            elif not database.num_keypoints_for_image(index + 1):
+                reason = "no features were found in it"
+            elif not refined:
+                reason = "the model could not be refined, and images are placed by its tracks"
+            else:
+                reason = "no place was found that its matches agree with"
+            remarks.append(ImageRemark(name=image.name, reason=reason))
+    return tuple(remarks)
 
 
 def _remarks_on_points(fitted: FittedModel, refinement: Refinement) -> tuple[str, ...]:

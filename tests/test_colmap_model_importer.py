@@ -431,6 +431,22 @@ def test_files_that_the_model_lacks_come_behind_its_images_with_the_camera_of_th
     assert not any("stay out" in remark for remark in fitted.remarks)
 
 
+def test_a_guessed_camera_is_that_of_a_run_and_not_the_fisheye_of_the_model() -> None:
+    fisheye = Intrinsics(model="OPENCV_FISHEYE", width=200, height=100, params=(90, 90, 100, 50, 0.1, 0, 0, 0))
+    records = [
+        scanned(*names, size=size).records
+        for names, size in ((("a.jpg", "b.jpg"), (200, 100)), (("x.jpg", "y.jpg"), (160, 120)))
+    ]
+    scan = replace(scanned("a.jpg"), records=(*records[0], *records[1]))
+    fitted = fit_to_images(foreign(["a.jpg", "b.jpg"], [fisheye], [0, 0]), scan, complete=True)
+    assert [camera.model for camera in fitted.collection.cameras] == ["OPENCV_FISHEYE", "SIMPLE_RADIAL"]
+    assert any("1 cameras were guessed as SIMPLE_RADIAL, " in one and "for 2 images" in one for one in fitted.remarks)
+    plain = fit_to_images(
+        foreign(["a.jpg", "b.jpg"], [fisheye], [0, 0]), scanned("a.jpg", "b.jpg", "c.jpg"), complete=True
+    )
+    assert not any("guessed" in remark for remark in plain.remarks)
+
+
 def test_no_camera_is_guessed_where_all_are_known() -> None:
     small = scanned("tele.jpg", size=(100, 80)).records
     scan = replace(scanned("a.jpg", "b.jpg", "c.jpg"), records=(*scanned("a.jpg", "b.jpg", "c.jpg").records, *small))
@@ -446,6 +462,22 @@ def test_an_image_without_a_pose_in_the_model_is_placed_like_one_that_it_lacks()
     fitted = fit_to_images(model, scanned("a.jpg", "b.jpg", "c.jpg"), complete=True)
     assert names_of(fitted) == ["b.jpg", "c.jpg", "a.jpg"]
     assert fitted.collection.rejected == ()
+
+
+@pytest.mark.parametrize("name", ["images/a.jpg", "a.png"])
+def test_an_image_without_a_pose_that_is_placed_under_another_spelling_is_not_left_out_too(name: str) -> None:
+    unposed = tuple(RejectedImage(name=one, reason="its pose is not finite") for one in (name, "gone.jpg"))
+    model = replace(foreign(["b.jpg", "c.jpg"], [intrinsics()], [0, 0]), unposed=unposed)
+    fitted = fit_to_images(model, scanned("a.jpg", "b.jpg", "c.jpg"), complete=True)
+    assert names_of(fitted) == ["b.jpg", "c.jpg", "a.jpg"]
+    assert [one.name for one in fitted.collection.rejected] == ["gone.jpg"]
+
+
+def test_each_file_is_that_of_one_image_without_a_pose() -> None:
+    unposed = tuple(RejectedImage(name=one, reason="its pose is not finite") for one in ("l/a.jpg", "r/a.jpg"))
+    model = replace(foreign(["b.jpg", "c.jpg"], [intrinsics()], [0, 0]), unposed=unposed)
+    fitted = fit_to_images(model, scanned("r/a.jpg", "b.jpg", "c.jpg"), complete=True)
+    assert [one.name for one in fitted.collection.rejected] == ["l/a.jpg"]
 
 
 def test_points_without_tracks_are_told_from_the_others(tmp_path: Path) -> None:

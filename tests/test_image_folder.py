@@ -24,6 +24,7 @@ from smust3r_colmap.errors import CollectionError, ConfigError, ImageError, Inpu
 from smust3r_colmap.importers import camera_prior, image_folder, images
 from smust3r_colmap.importers.image_folder import (
     ImportRecord,
+    check_masks_not_inside,
     check_output_not_inside,
     collection_from_scan,
     import_image_folder,
@@ -366,6 +367,17 @@ def test_refuses_an_output_among_the_images(tmp_path: Path) -> None:
             check_output_not_inside(photos, output)
     for output in (tmp_path, tmp_path / "photos_out", photos / ".." / "out"):
         check_output_not_inside(photos, output)
+
+
+def test_refuses_masks_among_the_images(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    (tmp_path / "link").symlink_to(photos)
+    for masks in (photos, photos / "masks", tmp_path / "link" / "masks"):
+        with pytest.raises(ConfigError, match=rf"--masks {masks}: lies inside the image folder {photos}"):
+            check_masks_not_inside(photos, str(masks))
+    for allowed in ("", str(tmp_path), str(tmp_path / "photos_masks")):
+        check_masks_not_inside(photos, allowed)
 
 
 # ----------------------------------------------------------------------------- pixels

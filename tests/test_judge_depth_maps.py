@@ -91,6 +91,19 @@ def test_measures_are_those_of_the_ratios() -> None:
     assert (found.delta_105, found.delta_125, found.coverage) == (3 / 6, 5 / 6, 6 / 12)
 
 
+def test_points_that_are_not_before_their_camera_are_counted_and_not_compared() -> None:
+    """A point as far behind the camera as the surface is before it would be off by nothing."""
+    model, truth = pycolmap.Reconstruction(), np.full((VIEW.height, VIEW.width), 2, np.float32)
+    model.add_camera_with_trivial_rig(VIEW.colmap_camera(1))
+    image = pycolmap.Image(name="a", camera_id=1, image_id=1)
+    image.points2D = pycolmap.Point2DList([pycolmap.Point2D([30.0, 40.0])] * 4)
+    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    for k, z in enumerate((2.0, 3.0, -2.0, 0.0)):
+        model.add_point3D([0, 0, z], pycolmap.Track([pycolmap.TrackElement(1, k)]), np.zeros(3, np.uint8))
+    ratios, num_behind = judge.point_ratios(model, model.image(1), truth)
+    assert (ratios.tolist(), num_behind) == ([1.0, 1.5], 2)
+
+
 def test_what_cannot_be_compared_has_no_figures() -> None:
     nothing = judge.figures("", np.empty(0), 7)
     assert nothing.coverage == 0
@@ -191,6 +204,7 @@ def test_exact_maps_are_right_but_for_the_edges(data: Path, tmp_path: Path, caps
     assert overall["coverage"] == pytest.approx(41 / 84, abs=0.02)
     assert points["num_compared"] > 60
     assert points["coverage"] is None
+    assert facts["num_behind"] == 0
     assert 0 < points["abs_rel"] < 0.02
     assert [one["what"] for one in facts["images"]] == ["a.jpg", "b.jpg", "c.jpg"]
     table = capsys.readouterr().out.splitlines()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,21 +14,24 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
+from smust3r_colmap import masked_maps
 from smust3r_colmap.backbones.classical import run_features
 from smust3r_colmap.backbones.classical.features import create_database, extract_features
 from smust3r_colmap.config import ClassicalConfig, ImportConfig, LoopConfig, OutputConfig, RunConfig
 from smust3r_colmap.demo import DemoScene, demo_intrinsics
-from smust3r_colmap.errors import ImageError, InputError
+from smust3r_colmap.errors import ConfigError, ImageError, InputError, RunDirectoryError
 from smust3r_colmap.evaluation import compare_trajectories, read_reference_sparse
 from smust3r_colmap.export_command import Export, run_export
+from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.image_folder import import_image_folder
 from smust3r_colmap.importers.masks import load_mask, names_without_mask, with_masks
 from smust3r_colmap.masked_maps import MaskedMaps
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.products import FloatArray, ImageCollection, ImageMask, SourceImage
 from smust3r_colmap.progress import QuietReporter
+from smust3r_colmap.refine_model import CameraChoice, refine_model
 from smust3r_colmap.run_directory import RunDirectory, key_of
 from smust3r_colmap.stored_depth import StoredDepthMaps
 
@@ -122,6 +126,55 @@ def test_a_broken_mask_is_refused_before_anything_is_done(drive: Drive, tmp_path
     path.write_bytes((drive.images / "003.png").read_bytes()[:size])
     with pytest.raises(ImageError, match=r"003.png: no image that can be read; masks are PNG"):
         collection_of(drive, tmp_path)
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_what_exif_says_of_turning_a_mask_is_not_looked_at(drive: Drive, tmp_path: Path, orientation: int) -> None:
+    """The same at the import and later: the upper half is black as it is stored, in a mask of the right size."""
+    kept = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    kept[: HEIGHT // 2] = 0
+    mask = Image.fromarray(kept)
+    exif = mask.getexif()
+    exif[ExifTags.Base.Orientation] = orientation
+    mask.save(tmp_path / "000.png", exif=exif)
+    image = collection_of(drive, tmp_path).images[0]
+    assert image.mask is not None
+    assert np.array_equal(load_mask(image.mask.path, image), kept)
+
+
+def test_masks_may_be_as_large_as_photographs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pillow's limit for what comes from the open net is lower than that of photographs."""
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
+    size = (80, 60)
+    write_mask(tmp_path / "a.png", *size)
+    image = SourceImage(name="a.jpg", path=tmp_path / "a.jpg", width=80, height=60, camera=0, digest="photograph")
+    camera = Intrinsics(model="PINHOLE", width=80, height=60, params=(70.0, 70.0, 40.0, 30.0))
+    (masked,) = with_masks(ImageCollection(images=(image,), cameras=(camera,)), tmp_path).images
+    assert masked.mask is not None
+
+
+def test_a_photograph_is_no_mask(drive: Drive, tmp_path: Path) -> None:
+    """By whatever way it came into the folder of masks, and also where an export is given that folder."""
+    collection = collection_of(drive)
+    (tmp_path / "000.png").write_bytes((drive.images / "000.png").read_bytes())
+    for masks in (drive.images, tmp_path):
+        with pytest.raises(ImageError, match=r"000.png: would be a mask and is the photograph 000.png, too; .* beside"):
+            with_masks(collection, masks)
+    (tmp_path / "link").symlink_to(drive.images)
+    with pytest.raises(ImageError, match=r"000.png: would be a mask and is the photograph"):
+        load_mask(tmp_path / "link" / "000.png", collection.images[0])
+
+
+def test_a_run_with_masks_among_the_images_ends_before_it_begins(drive: Drive, tmp_path: Path) -> None:
+    config = RunConfig(importing=ImportConfig(masks=str(drive.images)))
+    quiet, output = QuietReporter(sys.stderr), tmp_path / "out"
+    with pytest.raises(ConfigError, match=r"--masks .*/images: lies inside the image folder"):
+        reconstruct(drive.images, output, config, reporter=quiet)
+    with pytest.raises(ConfigError, match=r"--masks .*/images: lies inside the image folder"):
+        refine_model(
+            tmp_path, drive.images, output, config, cameras=CameraChoice(), pose_tolerance=0.03, reporter=quiet
+        )
+    assert not output.exists()
 
 
 # ------------------------------------------------------------------------------ features
@@ -219,6 +272,28 @@ def test_a_pixel_of_a_map_is_masked_as_its_centre_is(tmp_path: Path) -> None:
     assert {one.dtype.name for one in (maps.depth(0), maps.confidence(0), maps.pointmap_seg(0))} == {"float32"}
 
 
+def test_a_mask_is_decoded_once_for_each_content_and_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded: list[Path] = []
+
+    def counted(path: Path, image: SourceImage) -> npt.NDArray[np.uint8]:
+        decoded.append(path)
+        return load_mask(path, image)
+
+    monkeypatch.setattr(masked_maps, "load_mask", counted)
+    path = write_mask(tmp_path / "m.png", 60, 40)
+    image = SourceImage(
+        name="a", path=tmp_path, width=60, height=40, camera=0, digest="", mask=ImageMask(path=path, digest="white")
+    )
+    maps = MaskedMaps(maps=_Ones(), images=(image,))
+    for _ in range(3):
+        assert (maps.depth(0) == 5).all() and (maps.confidence(0) == 5).all() and (maps.pointmap_seg(0) == 5).all()
+    assert decoded == [path]
+    Image.new("L", (60, 40), 0).save(path)
+    blackened = replace(image, mask=ImageMask(path=path, digest="black"))
+    assert not MaskedMaps(maps=_Ones(), images=(blackened,)).depth(0).any()
+    assert decoded == [path, path]
+
+
 # ----------------------------------------------------------------------------- whole runs
 SETTINGS = RunConfig(
     classical=ClassicalConfig(max_features=800, dense_size=96, depth_planes=16),
@@ -283,3 +358,60 @@ def test_the_trainer_gets_the_masks_of_the_run_and_so_does_a_later_export(
             shares[Path(frame["file_path"]).stem] = float((mask == 0).mean())
         assert shares.pop("007") == 0
         assert all(0.18 < share < 0.24 for share in shares.values())
+
+
+def trainer_of(run: Path, output: Path, *, masks: Path | None = None) -> None:
+    run_export(Export(run=run, format=("trainer",), output=output, masks=masks, quiet=True), QuietReporter(sys.stderr))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("002.png.png", lambda path: path.unlink(), r"masks: the mask of 002.png is gone since the run; .* --masks"),
+        ("002.png.png", write_mask, r"002.png.png: the mask of 002.png has changed since the run; .* --masks"),
+        ("007.png", write_mask, r"007.png: the mask of 007.png is new since the run; .* --masks"),
+    ],
+    ids=["gone", "changed", "new"],
+)
+def test_masks_that_are_not_those_of_the_run_are_refused_unless_they_are_named(
+    masked_run: tuple[Path, str], tmp_path: Path, name: str, change: Callable[[Path], object], message: str
+) -> None:
+    output, _ = masked_run
+    masks = output.parent / "masks"
+    before = {path.name: path.read_bytes() for path in masks.iterdir()}
+    try:
+        change(masks / name)
+        with pytest.raises(ImageError, match=message):
+            trainer_of(output, tmp_path)
+        assert not any(tmp_path.iterdir())
+        trainer_of(output, tmp_path, masks=masks)
+        assert (tmp_path / "trainer" / "masks").is_dir()
+    finally:
+        (masks / name).unlink(missing_ok=True)
+        if name in before:
+            (masks / name).write_bytes(before[name])
+
+
+def test_a_folder_of_masks_that_is_gone_is_named_with_the_way_out(masked_run: tuple[Path, str], tmp_path: Path) -> None:
+    output, _ = masked_run
+    masks = output.parent / "masks"
+    masks.rename(output.parent / "moved")
+    try:
+        with pytest.raises(InputError, match=r"masks: the masks of the run are not there any more; .* --masks"):
+            trainer_of(output, tmp_path)
+    finally:
+        (output.parent / "moved").rename(masks)
+
+
+def test_a_finished_run_that_does_not_know_its_masks_is_of_another_version(
+    masked_run: tuple[Path, str], tmp_path: Path
+) -> None:
+    output, _ = masked_run
+    finished = output / "work" / "finished.json"
+    before = finished.read_text()
+    finished.write_text(json.dumps({**json.loads(before), "masks": "masks"}))
+    try:
+        with pytest.raises(RunDirectoryError, match="was written by another version; start the same"):
+            trainer_of(output, tmp_path)
+    finally:
+        finished.write_text(before)

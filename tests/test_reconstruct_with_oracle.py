@@ -88,6 +88,30 @@ def test_the_list_of_the_data_set_is_taken_unless_another_is_named(rgbd: Path, t
         script.chosen_images(rgbd, None, output)
 
 
+def test_names_may_have_blanks_and_lie_in_subfolders(rgbd: Path, tmp_path: Path) -> None:
+    names = ["left side/a b.jpg", "c.jpg"]
+    (rgbd / "images/left side").mkdir()
+    for name in names:
+        (rgbd / "images" / name).touch()
+    own_list = tmp_path / "names.txt"
+    own_list.write_text("".join(f"{name}\r\n" for name in names) + "\n")
+    for _ in range(2):  # links of an earlier start are no stranger's files
+        links = script.chosen_images(rgbd, own_list, tmp_path / "out")
+        found = {path.relative_to(links).as_posix(): path.resolve() for path in links.rglob("*.jpg")}
+        assert found == {name: (rgbd / "images" / name).resolve() for name in names}
+    (links / "left side/mine.txt").touch()
+    with pytest.raises(InputError, match=r"has 1 files besides links to the 2 images, such as left side/mine.txt"):
+        script.chosen_images(rgbd, own_list, tmp_path / "out")
+
+
+def test_names_outside_of_the_data_set_are_refused(rgbd: Path, tmp_path: Path) -> None:
+    (rgbd / "x.jpg").touch()
+    for name in ("../x.jpg", str(rgbd / "x.jpg")):
+        with pytest.raises(InputError, match=r"x.jpg does not lie in it; names are paths below that folder"):
+            script.link_images(rgbd / "images", [name], tmp_path / "links")
+    assert not (tmp_path / "links").exists()
+
+
 def test_links_to_another_data_set_are_made_anew(rgbd: Path, tmp_path: Path) -> None:
     links = tmp_path / "links"
     links.mkdir()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import shutil
+import tracemalloc
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -197,7 +198,8 @@ def test_images_that_the_model_lacks_are_placed_when_that_is_wanted(export: Expo
     summary = refined(wanted)
     assert (summary.num_images, summary.num_registered) == (NUM_IMAGES + 1, NUM_IMAGES)
     assert summary.refinements[0].registered == LACKING
-    assert [one.name for one in summary.unregistered] == ["grey.png"]
+    (grey,) = summary.unregistered
+    assert grey.name == "grey.png" and grey.reason == "no features were found in it"
     model = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
     assert model.num_cameras() == 1
     assert [model.image(i).name for i in sorted(model.images)][-2:] == list(LACKING)
@@ -248,10 +250,14 @@ def test_photographs_without_a_feature_leave_the_model_as_it_was(export: Export,
     photos.mkdir()
     for name in sorted(export.truth)[:3]:
         Image.new("RGB", (320, 240), (128, 128, 128)).save(photos / name)
-    summary = refined(replace(command(export, tmp_path / "out"), images=photos, text=True))
+    shutil.copy(export.images / sorted(export.truth)[3], photos / "new.png")  # with features, and nothing to match
+    summary = refined(replace(command(export, tmp_path / "out"), images=photos, text=True, complete=True))
     assert summary.exit_code == 3
+    assert [(one.name, one.reason) for one in summary.unregistered] == [
+        ("new.png", "the model could not be refined, and images are placed by its tracks")
+    ]
     assert any("has no tracks" in reason for reason in summary.weak_reasons)
-    assert any("5 of 8 files could not be used" in reason for reason in summary.weak_reasons)
+    assert any("5 of 9 files could not be used" in reason for reason in summary.weak_reasons)
     found = compare_trajectories(read_reference_sparse(tmp_path / "out/sparse/0"), export.start)
     assert found.num_compared == 3
     assert found.position_max < 1e-6
@@ -313,6 +319,22 @@ def test_points_follow_the_cameras_as_a_whole_and_stay_where_that_is_unknown() -
     assert np.allclose(followed, moved.apply(points), atol=1e-6)
     turned = scene_of(np.tile(world_from_cam[:1], (3, 1, 1)))
     assert np.array_equal(refined_from_start(turned, turned, 4.0).apply(points), points)
+
+
+def test_the_given_cloud_of_a_large_model_is_moved_without_comparing_every_two_cameras() -> None:
+    """1,500 cameras, each with each, would take 160 MB, and 5,000 eleven times as much."""
+    rng = np.random.default_rng(0)
+    world_from_cam = np.concatenate(
+        [Rotation.from_rotvec(rng.normal(size=(1500, 3))).as_matrix(), rng.normal(size=(1500, 3, 1))], axis=2
+    )
+    moved = Sim3(scale=np.array(1.3), rotation=np.eye(3), translation=np.array([1.0, 2, 3]))
+    start, refined_scene = scene_of(world_from_cam), scene_of(moved.move_cameras(world_from_cam))
+    tracemalloc.start()
+    found = refined_from_start(start, refined_scene, 4.0)
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert np.allclose(found.matrix, moved.matrix, atol=1e-6)
+    assert peak_bytes < 100e6
 
 
 def scene_of(world_from_cam: FloatArray) -> Scene:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import random
 import shutil
 import sqlite3
 from collections.abc import Callable, Mapping
@@ -593,12 +595,29 @@ def colmap_axes(good: Subject) -> Subject:
     return part("transforms", frames=frames)(good)
 
 
+def without_endings(good: Subject) -> Subject:
+    """As instant-ngp's own scenes name images; it finds them."""
+    assert good.transforms is not None
+    frames = tuple(replace(f, file_path=f.file_path.removesuffix(".png")) for f in good.transforms.frames)
+    by_ending = {k.removesuffix(".png"): v for k, v in good.transforms.images.items() if k[0] == "i"}
+    masks = {k: v for k, v in good.transforms.images.items() if k[0] != "i"}
+    return part("transforms", frames=frames, images=masks, images_by_ending=by_ending)(good)
+
+
 FROM_GOOD: dict[str, Case] = {
     "transforms-unreadable": (part("transforms", problem="it has no list of frames", frames=()), set()),
     "transforms-image-missing": (
         lambda good: part("transforms", images={k: v for k, v in good.transforms.images.items() if k[0] != "i"})(good),  # type: ignore[union-attr]
         set(),
     ),
+    "transforms-sharp-image-missing": (
+        lambda good: part("transforms", images={k: v for k, v in good.transforms.images.items() if k[0] != "i"})(  # type: ignore[union-attr]
+            part("transforms", has_sharpness=True)(good)
+        ),
+        set(),
+    ),
+    "transforms-image-ending": (without_endings, set()),
+    "transforms-comments": (part("transforms", has_comments=True), set()),
     "transforms-masks-incomplete": (with_first_frame(mask_path=""), set()),
     "transforms-points-missing": (part("transforms", ply_is_there=False), set()),
     "transforms-camera-model": (part("transforms", camera_model="FOV"), set()),
@@ -1101,6 +1120,8 @@ def test_depth_parameters_without_a_scale_are_unreadable(tmp_path: Path) -> None
         ("{", "Expecting property name"),
         ("[]", "no list of frames"),
         ('{"frames": [{"file_path": "a"}, {}]}', "frame 2 has no file_path"),
+        ('{"frames": []}', "its list of frames is empty"),
+        ('{"frames": /* none', "Expecting value"),
     ],
 )
 def test_a_transforms_file_that_cannot_be_read_says_why(tmp_path: Path, content: str, problem: str) -> None:
@@ -1121,6 +1142,102 @@ def test_a_frame_has_numbers_of_its_own_before_those_of_the_file(tmp_path: Path)
     assert np.isnan(found.frames[1].world_from_opengl).all()
     assert list(found.images) == ["a.png"]
     assert not found.ply_is_there
+
+
+NASTY: tuple[Any, ...] = (
+    *(None, True, "", "x" * 400, "\0", "\ud800", "/", "..", [], {}, [[1]], [[NAN] * 4] * 4, {"file_path": "a"}),
+    *(0, -1, 10**400, -(10**400), 1e308, -1e200, math.inf, NAN),
+)
+"""What a program with a bug, or somebody who means harm, may write in place of anything."""
+
+
+def with_something_nasty(document: Any, rng: random.Random) -> Any:
+    """The document with one of its values, wherever it lies, replaced."""
+    if not isinstance(document, (dict, list)) or not document or rng.random() < 0.1:
+        return rng.choice(NASTY)
+    if isinstance(document, dict):
+        key = rng.choice(sorted(document))
+        return {**document, key: with_something_nasty(document[key], rng)}
+    place = rng.randrange(len(document))
+    return [*document[:place], with_something_nasty(document[place], rng), *document[place + 1 :]]
+
+
+def test_no_transforms_file_stops_a_check(good: Subject, tmp_path: Path) -> None:
+    """Numbers beyond all floats, names that no file can have, matrices of texts: all of it is a finding, or none."""
+    model, rng = pycolmap.Reconstruction(good.model.folder), random.Random(0)
+    document = transforms_of(model)
+    rules = [rule for name, rule in RULES.items() if name.startswith("transforms-")]
+    path, seen = tmp_path / "transforms.json", set[str]()
+    for _ in range(200):
+        path.write_text(json.dumps(with_something_nasty(with_something_nasty(document, rng), rng)))
+        found = apply_rules(replace(good, transforms=read_transforms(path)), rules)
+        seen |= found.keys()
+        "".join(evidence.text for evidence in found.values()).encode()  # can be printed
+    assert {"transforms-unreadable", "transforms-intrinsics", "transforms-pose-not-rigid"} <= seen
+
+
+def test_numbers_too_large_for_a_float_are_infinite(tmp_path: Path) -> None:
+    document = {"fl_x": 10**400, "frames": [{"file_path": "x" * 400, "fl_y": -(10**400)}], "ply_file_path": "y" * 400}
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    found = read_transforms(tmp_path / "transforms.json")
+
+    assert (found.frames[0].numbers, found.ply_is_there) == ({"fl_x": math.inf, "fl_y": -math.inf}, False)
+
+
+@pytest.mark.parametrize("field", ["ply_file_path", "camera_model"])
+def test_texts_of_half_a_letter_can_be_reported(good: Subject, field: str) -> None:
+    broken = part("transforms", **{field: "\ud800", "ply_is_there": False})(good)
+    for evidence in apply_rules(broken, RULES.values()).values():
+        evidence.text.encode()
+
+
+def test_comments_are_told_and_texts_that_look_like_them_stay(tmp_path: Path) -> None:
+    write_image(tmp_path / "a//b.png", 40, 30)
+    (tmp_path / "transforms.json").write_text(
+        '{ // made by hand\n "frames": [/* one */ {"file_path": "a//b.png"}]}', encoding="utf-8-sig"
+    )
+    found = read_transforms(tmp_path / "transforms.json")
+
+    assert (found.problem, found.has_comments, list(found.images)) == ("", True, ["a//b.png"])
+
+
+def test_a_path_without_an_ending_is_found_by_those_that_instant_ngp_adds(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.jpg", 40, 30)
+    write_image(tmp_path / "b.png", 40, 30)
+    frames = [{"file_path": name} for name in ("b.png", "a", "b.jpg", "c")]
+    frames[1]["sharpness"] = "30"
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    found = read_transforms(tmp_path / "transforms.json")
+
+    assert (list(found.images), list(found.images_by_ending)) == (["b.png"], ["a"])
+    assert found.images_by_ending["a"].name == "a.jpg"
+    assert found.has_sharpness
+
+
+@pytest.mark.parametrize("model", ["VR180_L", "ORTHOPHOTO", "FISHEYE624", "OMNIDIRECTIONALSTEREO_R"])
+def test_camera_models_of_nerfstudio_alone_are_known(good: Subject, model: str) -> None:
+    assert found_in(part("transforms", camera_model=model)(good)) == ALWAYS
+
+
+def test_an_image_that_pillow_cannot_read_has_no_size_to_differ(good: Subject) -> None:
+    assert good.transforms is not None
+    images = {name: replace(file, width=0, height=0) for name, file in good.transforms.images.items()}
+
+    assert found_in(part("transforms", images=images)(good)) == ALWAYS
+
+
+@pytest.mark.parametrize(
+    ("rule", "stopped"),
+    [
+        ("transforms-unreadable", {"nerfstudio", "instant-ngp"}),
+        ("transforms-image-missing", {"nerfstudio", "instant-ngp"}),
+        ("transforms-sharp-image-missing", {"nerfstudio"}),
+        ("transforms-image-ending", {"nerfstudio"}),
+        ("transforms-comments", {"nerfstudio"}),
+    ],
+)
+def test_what_instant_ngp_passes_over_stops_nerfstudio_only(rule: str, stopped: set[str]) -> None:
+    assert {reader.name for reader in READERS if rule in reader.refuses} == stopped
 
 
 def test_a_depth_map_cut_short_has_no_size(tmp_path: Path) -> None:

@@ -22,8 +22,15 @@ _KNOWN_MODELS = (
     "OPENCV",
     "OPENCV_FISHEYE",
     "EQUIRECTANGULAR",
+    "OMNIDIRECTIONALSTEREO_L",
+    "OMNIDIRECTIONALSTEREO_R",
+    "VR180_L",
+    "VR180_R",
+    "ORTHOPHOTO",
+    "FISHEYE624",
 )
-"""Of nerfstudio, as far as COLMAP has them, too; none is a perspective camera."""
+"""All that nerfstudio's table of camera models has; it takes a file that names none (the first) for a perspective
+camera."""
 
 _ROUNDED = 1e-3
 """How far a rotation may be from orthonormal, and a camera from its place over the extent of all: rounded text."""
@@ -32,6 +39,7 @@ _MIN_COMPARED = 3
 _OPENCV_AXES = np.diag([1.0, -1.0, -1.0])
 
 _WRITE_TRAINER = "write the trainer folder again"
+_PATHS = "its paths are relative to its own folder, with the ending of the file"
 
 
 @rule(
@@ -47,16 +55,58 @@ def _unreadable(subject: Subject) -> Evidence | None:
 
 
 @rule(
+    "transforms-comments",
+    "transforms.json has comments",
+    severity=Severity.WARNING,
+    advice="leave them out; JSON has none",
+)
+def _comments(subject: Subject) -> Evidence | None:
+    if subject.transforms is None or not subject.transforms.has_comments:
+        return None
+    return measured("// or /* */ outside of its texts")
+
+
+@rule(
     "transforms-image-missing",
     "transforms.json names images that are not there",
     severity=Severity.WARNING,
-    advice="its paths are relative to its own folder, with the ending of the file",
+    advice=_PATHS,
 )
 def _image_missing(subject: Subject) -> Evidence | None:
+    if subject.transforms is None or subject.transforms.has_sharpness:
+        return None
+    return _missing_images(subject.transforms)
+
+
+@rule(
+    "transforms-sharp-image-missing",
+    "transforms.json has a sharpness for its frames, and names images that are not there",
+    severity=Severity.WARNING,
+    advice=_PATHS,
+)
+def _sharp_image_missing(subject: Subject) -> Evidence | None:
+    if subject.transforms is None or not subject.transforms.has_sharpness:
+        return None
+    return _missing_images(subject.transforms)
+
+
+def _missing_images(transforms: TransformsFile) -> Evidence | None:
+    there = transforms.images.keys() | transforms.images_by_ending.keys()
+    found = [repr(frame.file_path) for frame in transforms.frames if frame.file_path not in there]
+    return offenders(found, of=len(transforms.frames), unit="frames")
+
+
+@rule(
+    "transforms-image-ending",
+    "transforms.json names images without their ending",
+    severity=Severity.WARNING,
+    advice="write the ending of the file, such as .png",
+)
+def _image_ending(subject: Subject) -> Evidence | None:
     if subject.transforms is None:
         return None
-    frames, there = subject.transforms.frames, subject.transforms.images
-    found = [repr(frame.file_path) for frame in frames if frame.file_path not in there]
+    frames, there = subject.transforms.frames, subject.transforms.images_by_ending
+    found = [repr(frame.file_path) for frame in frames if frame.file_path in there]
     return offenders(found, of=len(frames), unit="frames")
 
 
@@ -84,7 +134,7 @@ def _points_missing(subject: Subject) -> Evidence | None:
     transforms = subject.transforms
     if transforms is None or transforms.problem or transforms.ply_is_there:
         return None
-    return measured(f"{transforms.ply_file_path} is not there" if transforms.ply_file_path else "no ply_file_path")
+    return measured(f"{transforms.ply_file_path!r} is not there" if transforms.ply_file_path else "no ply_file_path")
 
 
 @rule(
@@ -96,7 +146,7 @@ def _points_missing(subject: Subject) -> Evidence | None:
 def _camera_model(subject: Subject) -> Evidence | None:
     if subject.transforms is None or subject.transforms.camera_model in _KNOWN_MODELS:
         return None
-    return measured(subject.transforms.camera_model)
+    return measured(repr(subject.transforms.camera_model))
 
 
 @rule(
@@ -132,11 +182,13 @@ def _wrong_intrinsics(frame: TransformsFrame) -> str:
 def _size_differs(subject: Subject) -> Evidence | None:
     if subject.transforms is None:
         return None
-    found = []
+    found, files = [], {**subject.transforms.images, **subject.transforms.images_by_ending}
     for frame in subject.transforms.frames:
         width, height = frame.numbers.get("w", np.nan), frame.numbers.get("h", np.nan)
-        for file in (subject.transforms.images.get(name) for name in (frame.file_path, frame.mask_path)):
-            if file is not None and np.isfinite([width, height]).all() and (file.width, file.height) != (width, height):
+        if not np.isfinite([width, height]).all():
+            continue
+        for file in (files.get(name) for name in (frame.file_path, frame.mask_path)):
+            if file is not None and file.readable and (file.width, file.height) != (width, height):
                 found.append(f"{file.name!r} is {file.width} x {file.height}, not {width:g} x {height:g}")
     return offenders(found, of=len(subject.transforms.frames), unit="frames")
 
@@ -161,8 +213,9 @@ def _not_rigid(matrix: FloatArray) -> str:
     if not np.allclose(matrix[3], (0, 0, 0, 1)):
         return f"the last row is {' '.join(f'{number:g}' for number in matrix[3])}"
     rotation = matrix[:3, :3]
-    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if off > _ROUNDED:
+    with np.errstate(over="ignore", invalid="ignore"):  # of numbers without measure, which are off by NaN
+        off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if not off <= _ROUNDED:
         return f"the rotation is {off:.2g} from orthonormal"
     return "the axes are left-handed" if np.linalg.det(rotation) < 0 else ""
 
@@ -177,7 +230,9 @@ def _images_differ(subject: Subject) -> Evidence | None:
     if subject.transforms is None or subject.transforms.problem:
         return None
     names = set(subject.model.images.names)
-    of_frames = {_name_in_model(frame, names) or frame.file_path for frame in subject.transforms.frames}
+    of_frames = {
+        _name_in_model(subject.transforms, frame, names) or frame.file_path for frame in subject.transforms.frames
+    }
     found = [repr(name) for name in sorted(names ^ of_frames)]
     return offenders(found, of=len(names | of_frames), unit="images")
 
@@ -209,16 +264,19 @@ def _compared(transforms: TransformsFile, images: Images) -> Evaluation | None:
     of_file = {
         name: np.column_stack([pose[:3, :3] @ _OPENCV_AXES, pose[:3, 3]])
         for frame in transforms.frames
-        if (name := _name_in_model(frame, of_model.keys())) and not _not_rigid(pose := frame.world_from_opengl)
+        if (name := _name_in_model(transforms, frame, of_model.keys()))
+        and not _not_rigid(pose := frame.world_from_opengl)
     }
     try:
-        return compare_trajectories(of_file, of_model, min_compared=_MIN_COMPARED)
+        with np.errstate(over="ignore", invalid="ignore"):  # as above
+            return compare_trajectories(of_file, of_model, min_compared=_MIN_COMPARED)
     except DegenerateAlignmentError:  # two images, or a camera that only turned: no similarity
         return None
 
 
-def _name_in_model(frame: TransformsFrame, names: Collection[str]) -> str:
+def _name_in_model(transforms: TransformsFile, frame: TransformsFrame, names: Collection[str]) -> str:
     """The image of a frame: images/NAME is NAME; empty where the model has none of that name."""
-    path = PurePosixPath(frame.file_path)
+    with_ending = transforms.images_by_ending.get(frame.file_path)
+    path = PurePosixPath(with_ending.name if with_ending else frame.file_path)
     candidates = (str(path), str(PurePosixPath(*path.parts[1:])), path.name)
     return next((name for name in candidates if name in names), "")

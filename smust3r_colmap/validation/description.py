@@ -420,7 +420,10 @@ class TransformsFile:
         camera_model: empty where none is named. ply_file_path: likewise.
         frames: in the order of the file.
         images: headers of the images and masks that it names and that are there, by path as it stands.
+        images_by_ending: likewise, of paths without an ending that are there with one of ``ADDED_ENDINGS``.
         ply_is_there: the file of points exists.
+        has_sharpness: the first frame by path has one, which is where instant-ngp looks for it.
+        has_comments: as no JSON has, but some readers pass over.
         problem: why it could not be read; empty when it could.
     """
 
@@ -430,6 +433,9 @@ class TransformsFile:
     frames: tuple[TransformsFrame, ...]
     images: Mapping[str, ImageFile]
     ply_is_there: bool
+    images_by_ending: Mapping[str, ImageFile] = field(default_factory=dict)
+    has_sharpness: bool = False
+    has_comments: bool = False
     problem: str = ""
 
 

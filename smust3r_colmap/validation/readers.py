@@ -64,9 +64,10 @@ _READS_AS_STORED = "reads the pixels as stored, so width and height are swapped"
 _FLOAT32 = "computes with 32-bit numbers and rounds positions"
 _NO_START = "stops: has no points to start from"
 
+_NO_IMAGE_OF_TRANSFORMS = "stops at the first missing file of transforms.json"
 _TRANSFORMS_UNUSABLE = {
     "transforms-unreadable": "stops when it is given transforms.json",
-    "transforms-image-missing": "stops at the first missing file of transforms.json",
+    "transforms-image-missing": _NO_IMAGE_OF_TRANSFORMS,
     "transforms-pose-not-rigid": "trains from transforms.json with a camera that is none",
 }
 """Of nerfstudio's parser of transforms.json and of instant-ngp's loader, by their source."""
@@ -213,6 +214,9 @@ READERS: tuple[Reader, ...] = (
             "mask-missing": "stops when masks are wanted: every image needs one",
             "name-blank-in-text": "reads the name up to the first blank",
             **_TRANSFORMS_UNUSABLE,
+            "transforms-comments": "stops at the first comment when it is given transforms.json",
+            "transforms-sharp-image-missing": _NO_IMAGE_OF_TRANSFORMS,
+            "transforms-image-ending": _NO_IMAGE_OF_TRANSFORMS,
             "transforms-camera-model": "stops with a KeyError when it is given transforms.json",
             "transforms-intrinsics": "stops: wants focal lengths, principal point and size, for all or for every frame",
             "transforms-masks-incomplete": "stops: wants a mask for every frame of transforms.json or for none",
@@ -254,6 +258,7 @@ READERS: tuple[Reader, ...] = (
         },
         warns={
             "coordinates-large": _FLOAT32,
+            "transforms-sharp-image-missing": "leaves these frames of transforms.json out",
             "transforms-size-differs": "takes focal lengths and principal point in pixels of another size",
             "transforms-cameras-differ": "trains other cameras from transforms.json than from the model",
         },

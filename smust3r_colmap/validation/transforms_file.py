@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
+import os
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -19,26 +22,49 @@ from smust3r_colmap.validation.surroundings import read_image_file
 INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 """What a frame, or the whole file, says of its camera, in pixels."""
 
+ADDED_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".gif", ".tga", ".pic", ".pnm", ".psd", ".exr")
+"""What instant-ngp tries in turn for a path that has no ending and is not there."""
+
+_TEXT_OR_COMMENT = re.compile(r'"(?:\\.|[^"\\])*"|//[^\n]*|/\*.*?\*/', re.DOTALL)
+
 
 def read_transforms(path: Path) -> TransformsFile:
     """What the file says, and which of the files that it names are there."""
     try:
-        document = json.loads(path.read_bytes())
+        document, has_comments = _parsed(path.read_bytes())
         if not isinstance(document, dict) or not isinstance(document.get("frames"), list):
             raise ValueError("it has no list of frames")
+        if not document["frames"]:
+            raise ValueError("its list of frames is empty")
         frames = tuple(_frame(document, entry, number) for number, entry in enumerate(document["frames"], start=1))
     except (OSError, ValueError, RecursionError) as error:
         return _unreadable(path, str(error))
     ply = _text(document.get("ply_file_path"))
     named = {name for frame in frames for name in (frame.file_path, frame.mask_path) if name}
+    first = min(document["frames"], key=lambda frame: str(frame["file_path"]))
     return TransformsFile(
         path=path,
         camera_model=_text(document.get("camera_model")),
         ply_file_path=ply,
         frames=frames,
-        images={name: file for name in sorted(named) if (file := _image_file(path, name)) is not None},
-        ply_is_there=bool(ply) and (path.parent / ply).is_file(),
+        images=_found(named, lambda name: _image_file(path, name)),
+        ply_is_there=bool(ply) and os.path.isfile(path.parent / ply),
+        images_by_ending=_found(named, lambda name: _image_file_by_ending(path, name)),
+        has_sharpness="sharpness" in first,
+        has_comments=has_comments,
     )
+
+
+def _parsed(data: bytes) -> tuple[Any, bool]:
+    """The document, and whether it had to be freed of comments."""
+    try:
+        return json.loads(data), False
+    except ValueError:
+        text = data.decode("utf-8-sig")
+        bare = _TEXT_OR_COMMENT.sub(lambda found: found[0] if found[0].startswith('"') else " ", text)
+        if bare == text:
+            raise
+        return json.loads(bare), True
 
 
 def _unreadable(path: Path, problem: str) -> TransformsFile:
@@ -59,9 +85,20 @@ def _frame(document: dict[str, Any], entry: object, number: int) -> TransformsFr
     )
 
 
+def _found(names: Iterable[str], look: Callable[[str], ImageFile | None]) -> dict[str, ImageFile]:
+    return {name: file for name in sorted(names) if (file := look(name)) is not None}
+
+
 def _image_file(path: Path, name: str) -> ImageFile | None:
+    """``os.path.isfile`` says no to what can be no path, such as a name of 400 characters."""
     file = path.parent / name
-    return read_image_file(file, name) if file.is_file() else None
+    return read_image_file(file, name) if os.path.isfile(file) else None
+
+
+def _image_file_by_ending(path: Path, name: str) -> ImageFile | None:
+    if PurePosixPath(name).suffix or os.path.isfile(path.parent / name):
+        return None
+    return next((file for ending in ADDED_ENDINGS if (file := _image_file(path, name + ending)) is not None), None)
 
 
 def _text(value: object) -> str:
@@ -69,7 +106,13 @@ def _text(value: object) -> str:
 
 
 def _number(value: object) -> float:
-    return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
+    """NaN for what is none; infinite where it is beyond all that a float can be."""
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
+        return math.nan
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
 
 
 def _matrix(value: object) -> FloatArray:
