@@ -41,6 +41,7 @@ from smust3r_colmap.refinement.adjustment import (
     adjust_part,
     extent_of,
     figures_of,
+    mean_covisible,
     pose_priors,
     priors_of,
     triangulate,
@@ -139,6 +140,37 @@ def test_disturbed_cameras_come_back_to_the_truth_in_its_own_frame_and_scale(rou
     assert max(angle_deg(a, b) for a, b in zip(found, world.cam_from_world, strict=True)) < 0.3
     assert 0.15 < figures_of(model).reprojection_error_px < 0.5
     assert abs(model.camera(1).params[0] / CAMERA.params[0] - 1) < 0.02
+
+
+def test_equations_solved_iteratively_lead_to_the_same_minimum(
+    round_a_ball: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As those of many images that all see the same are; the last bits tell that it is another solver."""
+    start = disturbed_around_the_truth(round_a_ball.world, np.random.default_rng(1))
+    found = []
+    for limit in (adjustment.MAX_COVISIBLE, 0):
+        monkeypatch.setattr(adjustment, "MAX_COVISIBLE", limit)
+        model, _ = round_a_ball.model(start)
+        priors = priors_of(model)
+        assert adjust(model, priors, calibrated=False, max_iterations=100, threads=1, function_tolerance=1e-10)
+        found.append(poses_in_order(model))
+    direct, iterative = found
+    np.testing.assert_allclose(iterative, direct, atol=1e-3)
+    assert not np.array_equal(iterative, direct)
+
+
+def test_covisibility_counts_the_images_that_share_points_with_an_image() -> None:
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, model="PINHOLE", width=9, height=9, params=[9] * 4))
+    for image_id in (1, 2, 3, 4, 9):
+        image = pycolmap.Image(name=str(image_id), camera_id=1, image_id=image_id)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(np.zeros(2))] * 2)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    assert mean_covisible(model) == 0
+    for row, images in enumerate([(1, 2, 3), (3, 4)]):
+        track = pycolmap.Track([pycolmap.TrackElement(image_id, row) for image_id in images])
+        model.add_point3D(np.zeros(3), track, np.zeros(3, np.uint8))
+    assert mean_covisible(model) == pytest.approx((2 + 2 + 3 + 1) / 4)
 
 
 def test_without_priors_the_scale_drifts(round_a_ball: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
