@@ -103,7 +103,7 @@ def ask_consent(features: MatchedFeatures, views: Mapping[int, View], *, toleran
         views: by image index.
         tolerance: Sampson distance allowed, as a part of the longer image side.
     """
-    rays = {i: view.intrinsics.rays_cam(features.keypoints[i])[:, :2] for i, view in views.items()}
+    seen = {i: _SeenRays.of(view, features.keypoints[i]) for i, view in views.items()}
     kept: dict[Pair, npt.NDArray[np.uint32]] = {}
     refused: dict[Pair, float] = {}
     num_dropped = 0
@@ -114,13 +114,13 @@ def ask_consent(features: MatchedFeatures, views: Mapping[int, View], *, toleran
                 kept[pair] = verified
             continue
         if verified is not None:
-            consent = float(_on_epipolar_lines(pair, verified, views, rays, tolerance).mean())
+            consent = float(_on_epipolar_lines(pair, verified, seen, tolerance).mean())
             if consent < MIN_CONSENT:
                 refused[pair] = consent
                 continue
         # What verification left out of a pair is mostly wrong by little, and bends the model.
         matches = raw if verified is None else verified
-        good = _on_epipolar_lines(pair, matches, views, rays, tolerance)
+        good = _on_epipolar_lines(pair, matches, seen, tolerance)
         # Without verification, chance puts a few matches on their lines, but not so many of all.
         if good.sum() >= MIN_MATCHES and good.mean() >= MIN_CONSENT:
             kept[pair] = matches[good]
@@ -143,36 +143,56 @@ def consent_shares(
         tolerance: as in ``ask_consent``.
         min_matches: pairs with fewer verified matches are left out.
     """
-    rays = {i: view.intrinsics.rays_cam(features.keypoints[i])[:, :2] for i, view in views.items()}
+    seen = {i: _SeenRays.of(view, features.keypoints[i]) for i, view in views.items()}
     return {
-        pair: float(_on_epipolar_lines(pair, rows, views, rays, tolerance).mean())
+        pair: float(_on_epipolar_lines(pair, rows, seen, tolerance).mean())
         for pair, rows in features.verified.items()
         if len(rows) >= min_matches and pair[0] in views and pair[1] in views
     }
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _SeenRays:
+    """What an image contributes to all of its pairs.
+
+    Args:
+        cam_from_world: (3, 4). rays: (K, 3) of its keypoints at depth 1.
+        longer_side: of the image, in focal lengths.
+    """
+
+    cam_from_world: FloatArray
+    rays: FloatArray
+    longer_side: float
+
+    @classmethod
+    def of(cls, view: View, keypoints: npt.NDArray[np.float32]) -> _SeenRays:
+        intrinsics = view.intrinsics
+        return cls(
+            cam_from_world=view.cam_from_world,
+            rays=intrinsics.rays_cam(keypoints),
+            longer_side=max(intrinsics.width, intrinsics.height) / intrinsics.focal_px,
+        )
+
+
 def _on_epipolar_lines(
     pair: Pair,
     matches: npt.NDArray[np.uint32],
-    views: Mapping[int, View],
-    rays: Mapping[int, FloatArray],
+    seen: Mapping[int, _SeenRays],
     tolerance: float,
 ) -> npt.NDArray[np.bool_]:
     """(M,) Sampson distance within the tolerance; for a camera that only turned every direction is a line."""
-    i, j = pair
-    intrinsics_a, intrinsics_b = views[i].intrinsics, views[j].intrinsics
-    b_from_world, world_from_a = views[j].cam_from_world, invert_rigid(views[i].cam_from_world)
+    seen_a, seen_b = (seen[index] for index in pair)
+    b_from_world, world_from_a = seen_b.cam_from_world, invert_rigid(seen_a.cam_from_world)
     rotation = b_from_world[:, :3] @ world_from_a[:, :3]
     translation = b_from_world[:, :3] @ world_from_a[:, 3] + b_from_world[:, 3]
     length = np.linalg.norm(translation)
     direction = translation / length if length > 0 else np.array([1.0, 0.0, 0.0])
     essential = skew(direction) @ rotation
-    a = np.column_stack([rays[i][matches[:, 0]], np.ones(len(matches))])
-    b = np.column_stack([rays[j][matches[:, 1]], np.ones(len(matches))])
+    a, b = seen_a.rays[matches[:, 0]], seen_b.rays[matches[:, 1]]
     line_b, line_a = a @ essential.T, b @ essential
     residual = np.abs(np.einsum("ij,ij->i", b, line_b))
     slope = np.sqrt((line_b[:, :2] ** 2).sum(axis=1) + (line_a[:, :2] ** 2).sum(axis=1))
     # Both images count alike, whichever comes first: one may be a wide angle, the other a tele lens.
-    limit = tolerance * np.mean([max(one.width, one.height) / one.focal_px for one in (intrinsics_a, intrinsics_b)])
+    limit = tolerance * (seen_a.longer_side + seen_b.longer_side) / 2
     good: npt.NDArray[np.bool_] = residual <= limit * slope  # NaN rays, where undistortion fails, are not good
     return good

@@ -254,7 +254,9 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
         bench.filter(MAX_ERROR_PX)
     why_not = _why_principal_points_stay(bench.model, priors, task)
     if not why_not:
-        moved = _adjustment("principal point", bench.model, priors, task, SECOND_ITERATIONS, principal_point=True)
+        moved = _adjustment(
+            "principal point", bench.model, priors, task, SECOND_ITERATIONS, principal_point=True, rough=True
+        )
         steps.append(moved)
         why_not = moved.reason
         bench.filter(MAX_ERROR_PX)
