@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,6 +51,17 @@ def data_dir() -> Callable[[str], Path]:
         return root / name
 
     return find
+
+
+@pytest.fixture(scope="module")
+def quiet_pycolmap() -> Iterator[None]:
+    """Without what pycolmap says of models that are broken on purpose."""
+    import pycolmap  # noqa: PLC0415  (heavy, and few tests need it)
+
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = 3
+    yield
+    pycolmap.logging.minloglevel = level
 
 
 @pytest.fixture(scope="session")

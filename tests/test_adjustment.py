@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -47,6 +47,8 @@ from smust3r_colmap.refinement.adjustment import (
     triangulate,
     weak_images,
 )
+
+pytestmark = pytest.mark.usefixtures("quiet_pycolmap")
 
 LOOSE = Tolerance(pixels=8.0, angle_deg=4.0)
 ITERATIONS = 30
@@ -108,14 +110,6 @@ def round_a_ball(make_bench: MakeBench) -> Bench:
 def road(make_bench: MakeBench) -> Bench:
     rng = np.random.default_rng(2)
     return make_bench("road", make_world(straight(10), rng.uniform([-3, -2, 4], [5, 2, 9], (300, 3)), rng))
-
-
-@pytest.fixture(autouse=True)
-def _quiet() -> Iterator[None]:
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = 3
-    yield
-    pycolmap.logging.minloglevel = level
 
 
 def poses_in_order(model: pycolmap.Reconstruction) -> FloatArray:

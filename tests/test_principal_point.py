@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -50,19 +50,13 @@ from smust3r_colmap.refinement.task import RefinedFigures, RefineTask, refine_sc
 from smust3r_colmap.run_directory import RunDirectory, StageFolder
 from smust3r_colmap.stage_clock import StageClock
 
+pytestmark = pytest.mark.usefixtures("quiet_pycolmap")
+
 MIDDLE = np.array([320.0, 240.0])
 SHIFT = np.array([5.12, -3.84])
 """One percent of the width: 6.4 px."""
 NUM_IMAGES = 20
 APART = r"two halves of the points put it [\d.]+ px apart, for a shift of [\d.]+ px"
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _quiet() -> Iterator[None]:
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = 3
-    yield
-    pycolmap.logging.minloglevel = level
 
 
 def off_centre(shift: FloatArray, *, distortion: float = CAMERA.params[3]) -> Intrinsics:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import sqlite3
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing import active_children
 from pathlib import Path
@@ -54,6 +54,8 @@ from smust3r_colmap.refinement.task import RefinedFigures, RefineTask, refine_sc
 from smust3r_colmap.run_directory import RunDirectory, StageFolder, read_json
 from smust3r_colmap.stage_clock import StageClock
 
+pytestmark = pytest.mark.usefixtures("quiet_pycolmap")
+
 NUM_IMAGES = 14
 REACH = 5
 NAMES = {3: "ein Bild 03.png", 5: "Größe/画像 5.png", 12: "Größe/ä ö.png"}
@@ -61,14 +63,6 @@ WITHOUT_POSE, UNVERIFIED, BLIND, WEAK = 5, 8, 10, 12
 LOOK_ALIKE = (0, 13)
 SOUND = [i for i in range(NUM_IMAGES) if i not in (WITHOUT_POSE, BLIND, WEAK)]
 Rows = npt.NDArray[np.uint32]
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _quiet() -> Iterator[None]:
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = 3
-    yield
-    pycolmap.logging.minloglevel = level
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,17 +35,11 @@ from smust3r_colmap.refinement.replacement import Replacement, place_bent_images
 from smust3r_colmap.refinement.task import RefineTask, refine_scenes
 from smust3r_colmap.run_directory import StageFolder
 
+pytestmark = pytest.mark.usefixtures("quiet_pycolmap")
+
 NUM_IMAGES, LAST_SOUND = 14, 9
 BENT = range(LAST_SOUND + 1, NUM_IMAGES)
 TOLERANCE = Tolerance(pixels=TIGHT_PART * 640, angle_deg=2.0)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _quiet() -> Iterator[None]:
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = 3
-    yield
-    pycolmap.logging.minloglevel = level
 
 
 @pytest.fixture(scope="module")

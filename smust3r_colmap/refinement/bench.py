@@ -90,6 +90,11 @@ class Bench:
             self.collection, cameras, consent, {}, scratch=self.scratch, threads=self.threads, model=self.model
         )
 
+    def views(self, poses: Mapping[int, FloatArray] | None = None) -> dict[int, View]:
+        """The model's cameras as consent asks for them; or as the given (3, 4) poses have them."""
+        cameras = cameras_of(self.model, self.collection.cameras)
+        return views_of(poses_of(self.model) if poses is None else poses, cameras, self.collection)
+
     def filter(self, pixels: float) -> None:
         """Leave out observations that are too far off and points that are seen under no angle."""
         self.mapper.observation_manager.filter_all_points3D(pixels, MIN_ANGLE_DEG)

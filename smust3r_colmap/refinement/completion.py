@@ -19,7 +19,14 @@ import pycolmap
 
 from smust3r_colmap.execution import TaskFailure, map_tasks
 from smust3r_colmap.refinement.adjustment import ENOUGH_OBSERVATIONS, ModelFigures, figures_of, weak_images
-from smust3r_colmap.refinement.steps import MAX_LOST, StepReport, movement, num_good_observations, take_snapshot
+from smust3r_colmap.refinement.steps import (
+    MAX_LOST,
+    StepReport,
+    movement,
+    num_good_observations,
+    report_of,
+    take_snapshot,
+)
 
 Agrees = Callable[[pycolmap.Reconstruction, int], bool]
 
@@ -143,26 +150,9 @@ def _why_not_kept(
 
 def _report(completed: pycolmap.Reconstruction, model: pycolmap.Reconstruction, before: ModelFigures) -> StepReport:
     moved, turned = movement(completed, take_snapshot(model).rig_from_world)
-    return StepReport(
-        name=NAME,
-        before=before,
-        after=figures_of(completed),
-        moved_percent=float(np.median(moved)),
-        max_moved_percent=float(moved.max()),
-        turned_deg=float(np.median(turned)),
-        kept=True,
-    )
+    return report_of(NAME, before, figures_of(completed), moved, turned)
 
 
 def _nothing_added(model: pycolmap.Reconstruction, before: ModelFigures, reason: str) -> Completion:
-    report = StepReport(
-        name=NAME,
-        before=before,
-        after=before,
-        moved_percent=0.0,
-        max_moved_percent=0.0,
-        turned_deg=0.0,
-        kept=False,
-        reason=reason,
-    )
+    report = report_of(NAME, before, before, np.zeros(0), np.zeros(0), reason)
     return Completion(model=model, registered=(), report=report)

@@ -15,7 +15,6 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import pycolmap
 
 from smust3r_colmap.errors import DegenerateAlignmentError
@@ -25,19 +24,18 @@ from smust3r_colmap.exporters.colmap_database import write_colmap_database
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import FloatArray
 from smust3r_colmap.refinement.adjustment import ModelFigures, Tolerance, figures_of, triangulate
-from smust3r_colmap.refinement.bench import TIGHT_PART, Bench, cameras_of, poses_of, views_of
+from smust3r_colmap.refinement.bench import TIGHT_PART, Bench, cameras_of, poses_of
 from smust3r_colmap.refinement.bends import SOUND_SHARE, Agreement, bent_images
 from smust3r_colmap.refinement.correspondences import Pair
 from smust3r_colmap.refinement.feature_matches import (
     MIN_CONSENT,
     MIN_MATCHES,
     MIN_VERIFIED,
-    Consent,
     MatchedFeatures,
     ask_consent,
     consent_shares,
 )
-from smust3r_colmap.refinement.steps import StepReport, movement
+from smust3r_colmap.refinement.steps import StepReport, movement, report_of
 
 logger = logging.getLogger(__name__)
 
@@ -92,7 +90,7 @@ def place_bent_images_again(bench: Bench, features: MatchedFeatures, tolerance: 
         bench.mapper.observation_manager.deregister_frame(frame_id)
         bench.model.frame(frame_id).rig_from_world = pycolmap.Rigid3d(pose)
         bench.model.register_frame(frame_id)
-    bench = bench.with_matches(_consent(bench, features))
+    bench = bench.with_matches(ask_consent(features, bench.views(), tolerance=TIGHT_PART))
     triangulate(bench.mapper, tolerance)
     return Replacement(bench=bench, cam_from_world=found, report=_report(bench, figures, poses, ""))
 
@@ -118,17 +116,7 @@ def _why_no_better(
 
 def _report(bench: Bench, before: ModelFigures, poses: Mapping[int, FloatArray], reason: str) -> StepReport:
     old = {bench.model.image(i + 1).frame_id: pycolmap.Rigid3d(pose) for i, pose in poses.items()}
-    moved, turned = movement(bench.model, old)
-    return StepReport(
-        name=NAME,
-        before=before,
-        after=figures_of(bench.model),
-        moved_percent=float(np.median(moved)),
-        max_moved_percent=float(moved.max()),
-        turned_deg=float(np.median(turned)),
-        kept=not reason,
-        reason=reason,
-    )
+    return report_of(NAME, before, figures_of(bench.model), *movement(bench.model, old), reason)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,11 +202,5 @@ def _neighbours(bent: Collection[int], images: Collection[int], features: Matche
 
 
 def _agreements(bench: Bench, poses: Mapping[int, FloatArray], features: MatchedFeatures) -> dict[Pair, Agreement]:
-    views = views_of(poses, cameras_of(bench.model, bench.collection.cameras), bench.collection)
-    shares = consent_shares(features, views, tolerance=TIGHT_PART, min_matches=MIN_MATCHES)
+    shares = consent_shares(features, bench.views(poses), tolerance=TIGHT_PART, min_matches=MIN_MATCHES)
     return {pair: Agreement(num_matches=len(features.verified[pair]), share=share) for pair, share in shares.items()}
-
-
-def _consent(bench: Bench, features: MatchedFeatures) -> Consent:
-    views = views_of(poses_of(bench.model), cameras_of(bench.model, bench.collection.cameras), bench.collection)
-    return ask_consent(features, views, tolerance=TIGHT_PART)

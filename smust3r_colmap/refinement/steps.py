@@ -114,6 +114,13 @@ def tried_step(name: str, model: pycolmap.Reconstruction, step: Callable[[], boo
     moved, turned = movement(model, snapshot.rig_from_world) if usable else (np.zeros(0), np.zeros(0))
     if reason:
         restore(model, snapshot)
+    return report_of(name, before, after, moved, turned, reason)
+
+
+def report_of(
+    name: str, before: ModelFigures, after: ModelFigures, moved: FloatArray, turned: FloatArray, reason: str = ""
+) -> StepReport:
+    """The report of a step after which ``movement`` says ``moved``, ``turned``; both empty where no camera can move."""
     return StepReport(
         name=name,
         before=before,

@@ -66,7 +66,7 @@ from smust3r_colmap.refinement.pointmap_matches import MappedView, match_by_poin
 from smust3r_colmap.refinement.principal_point import ask_for_principal_points
 from smust3r_colmap.refinement.replacement import NAME as REPLACEMENT
 from smust3r_colmap.refinement.replacement import place_bent_images_again
-from smust3r_colmap.refinement.steps import MAX_ERROR_PX, StepReport, tried_step
+from smust3r_colmap.refinement.steps import MAX_ERROR_PX, StepReport, report_of, tried_step
 from smust3r_colmap.run_directory import StageFolder, write_json
 
 logger = logging.getLogger(__name__)
@@ -235,9 +235,7 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
     bench.filter(FIRST_FILTER_PX)
 
     tight = Tolerance(pixels=max(TIGHT_PART * _longer_side(task), MIN_TIGHT_PX), angle_deg=TIGHT_ANGLE_DEG)
-    poses, cameras = poses_of(bench.model), cameras_of(bench.model, cameras)
-    consent = ask_consent(features, views_of(poses, cameras, task.collection), tolerance=TIGHT_PART)
-    bench = bench.with_matches(consent)
+    bench = bench.with_matches(ask_consent(features, bench.views(), tolerance=TIGHT_PART))
     registered = bench.register_missing(features, tight)
     steps.append(_triangulation(bench, tight, name="longer tracks"))
     bench.drop_needless_pairs()
@@ -276,15 +274,7 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
 def _triangulation(bench: Bench, tolerance: Tolerance, *, name: str = "triangulation") -> StepReport:
     before = figures_of(bench.model)
     triangulate(bench.mapper, tolerance)
-    return StepReport(
-        name=name,
-        before=before,
-        after=figures_of(bench.model),
-        moved_percent=0.0,
-        max_moved_percent=0.0,
-        turned_deg=0.0,
-        kept=True,
-    )
+    return report_of(name, before, figures_of(bench.model), moved=np.zeros(0), turned=np.zeros(0))
 
 
 def _adjustment(
