@@ -2,8 +2,8 @@
 
 No mapper is safe alone: the incremental one finds no start on straight forward motion and stops at
 weak spots, the global one registers more but may be wrong with a perfect-looking error. So a ladder
-is climbed until the models pass the checks: incremental, relaxed incremental, global. What still does
-not hold together becomes several pieces. Everything here runs in a child process.
+is climbed until the models pass the checks: incremental from a chosen pair, relaxed incremental, global.
+What still does not hold together becomes several pieces. Everything here runs in a child process.
 The next module to read is ``calibration``.
 """
 
@@ -32,9 +32,10 @@ from smust3r_colmap.backbones.classical.model_checks import (
     absurd_focal,
     diverged_focal,
     find_denied_steps,
+    find_doubtful_jumps,
     find_hinges,
-    find_jumps,
 )
+from smust3r_colmap.backbones.classical.start_pair import ENOUGH_ANGLE_DEG, StartPair, choose_start_pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import UnregisteredImage
 
@@ -48,6 +49,10 @@ MIN_PAIR_INLIERS = 15
 """Verified matches below which COLMAP does not use a pair."""
 NEAR_OFFSET = 4
 """Reach of the pairs that are left when the longer ones folded the model."""
+ANGLE_TOLERANCE = 0.7
+"""Share of the chosen pair's angle that the mapper, which estimates it again by sampling, has to find."""
+MAX_MODELS = 6
+"""Models that one attempt may start; what is left of a segment after so many is crumbs that cost minutes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,15 +124,15 @@ class _Ladder:
         if not any(count >= MIN_PAIR_INLIERS for count in self.inliers.values()):
             self.attempts.append(f"no pair of images has {MIN_PAIR_INLIERS} verified matches")
             return
-        self._attempt("incremental", self._incremental("segment.db", relaxed=False))
+        self._attempt("incremental", self._from_chosen_pair("segment.db", self.task.pairs))
         if self._enough():
             return
         if self.largest_output is not None:
             start = self.largest_output
-            self._attempt("incremental, continued relaxed", self._incremental("segment.db", relaxed=True, start=start))
+            self._attempt("incremental, continued relaxed", self._incremental(start=start))
         if self._enough():
             return
-        self._attempt("incremental, relaxed start", self._incremental("segment.db", relaxed=True))
+        self._attempt("incremental, relaxed start", self._incremental())
         if not self._enough() and self.task.use_global:
             self._attempt("global", self._global())
 
@@ -174,7 +179,7 @@ class _Ladder:
         found = self._convert(models, name)
         if self._count_jumps(found):
             self.largest_output = None
-            second = self._convert(self._incremental("segment.db", relaxed=True), f"{name}, second opinion")
+            second = self._convert(self._incremental(), f"{name}, second opinion")
             better = bool(second) and self._count_jumps(second) < self._count_jumps(found)
             self.attempts.append(
                 f"{name}: {self._count_jumps(found)} jumps between neighbours that match, "
@@ -193,7 +198,7 @@ class _Ladder:
             if name == "incremental":
                 near = tuple(pair for pair in self.task.pairs if pair[1] - pair[0] <= NEAR_OFFSET)
                 self._build_database("near.db", near)
-                again = self._convert(self._incremental("near.db", relaxed=False), f"{name}, near pairs")
+                again = self._convert(self._from_chosen_pair("near.db", near), f"{name}, near pairs")
                 parts = [part for model in again for part in self._cut(model)]
                 if len(placed_images(parts)) >= len(placed_images(found)):
                     self.attempts.append(f"{name}: mapped again with near pairs only")
@@ -218,45 +223,64 @@ class _Ladder:
             for models in self.candidates
         )
 
-    def _incremental(
-        self, database: str, *, relaxed: bool, start: Path | None = None
-    ) -> dict[int, pycolmap.Reconstruction]:
+    def _from_chosen_pair(self, database: str, pairs: Sequence[Pair]) -> dict[int, pycolmap.Reconstruction]:
+        """One model from the best pair to start with; nothing where there is none."""
+        camera_of = dict(zip(self.task.images, self.task.camera_indices, strict=True))
+        cameras = {image: self.task.cameras[index] for image, index in camera_of.items()}
+        with open_database(self.scratch / database) as opened:
+            pair = choose_start_pair(opened, pairs, cameras, seed=self.task.seed)
+        if pair is None:
+            return {}
+        models = self._run_incremental(database, database.replace(".db", "-chosen"), _from_pair(self._options(), pair))
+        if database == "segment.db" and models:
+            self.largest_output = self.scratch / "segment-chosen" / str(max(models))
+        return models
+
+    def _incremental(self, *, start: Path | None = None) -> dict[int, pycolmap.Reconstruction]:
+        """Models with relaxed demands, continued from ``start`` or from pairs that COLMAP finds."""
+        options = self._options()
+        options.max_num_models = MAX_MODELS
+        options.mapper.init_min_tri_angle = 3.0
+        options.mapper.init_max_forward_motion = 1.0
+        options.mapper.init_min_num_inliers = 50
+        options.mapper.abs_pose_min_num_inliers = 15
+        return self._run_incremental("segment.db", "continued" if start else "relaxed", options, start=start)
+
+    def _options(self) -> pycolmap.IncrementalPipelineOptions:
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = 1
         options.random_seed = self.task.seed
         options.extract_colors = False
         options.min_model_size = self.min_images
         options.max_model_overlap = 20
-        # COLMAP runs every adjustment to a function tolerance of 0; this stops when nothing moves any more.
-        options.ba_local_function_tolerance = 1e-6
-        options.ba_global_function_tolerance = 1e-6
-        options.ba_global_max_refinements = 3
+        # COLMAP adjusts to a function tolerance of 0 whenever a model has grown by a tenth. A segment is adjusted
+        # again under the cameras of the run and in the whole scene, so it needs to converge once, at the end.
+        options.ba_local_function_tolerance = 1e-4
+        options.ba_local_max_refinements = 1
+        options.ba_global_function_tolerance = 1e-5
+        options.ba_global_max_refinements = 2
+        options.ba_global_frames_ratio = 1.4
+        options.ba_global_points_ratio = 1.4
         options.ba_refine_focal_length = not self.task.calibrated
         options.ba_refine_extra_params = not self.task.calibrated
         options.mapper.num_threads = 1
         options.mapper.random_seed = self.task.seed
         options.triangulation.random_seed = self.task.seed
-        if relaxed:
-            options.mapper.init_min_tri_angle = 3.0
-            options.mapper.init_max_forward_motion = 1.0
-            options.mapper.init_min_num_inliers = 50
-            options.mapper.abs_pose_min_num_inliers = 15
         if len(self.task.images) < MIN_PIECE_IMAGES:
             # There is hardly a third view that could confirm a point.
             options.triangulation.ignore_two_view_tracks = False
-        name = "incremental" if not relaxed else ("continued" if start else "relaxed")
-        output = self.scratch / (name if database == "segment.db" else f"{name}-near")
-        if output.name in self.mapped:  # a second opinion and a later rung may ask the same
-            return self.mapped[output.name]
-        output.mkdir()
-        models: dict[int, pycolmap.Reconstruction] = pycolmap.incremental_mapping(
-            self.scratch / database, self.scratch, output, options, input_path=start or ""
-        )
-        self.mapped[output.name] = models
-        if database == "segment.db" and not relaxed and models:
-            largest = max(models, key=lambda number: models[number].num_reg_images())
-            self.largest_output = output / str(largest)
-        return models
+        return options
+
+    def _run_incremental(
+        self, database: str, name: str, options: pycolmap.IncrementalPipelineOptions, *, start: Path | None = None
+    ) -> dict[int, pycolmap.Reconstruction]:
+        if name not in self.mapped:  # a second opinion and a later rung may ask the same
+            output = self.scratch / name
+            output.mkdir()
+            self.mapped[name] = pycolmap.incremental_mapping(
+                self.scratch / database, self.scratch, output, options, input_path=start or ""
+            )
+        return self.mapped[name]
 
     def _global(self) -> dict[int, pycolmap.Reconstruction]:
         options = pycolmap.GlobalPipelineOptions()
@@ -285,7 +309,8 @@ class _Ladder:
         return absurd_focal(model) or diverged_focal(model, camera_of, self.task.trusted_focal)
 
     def _count_jumps(self, models: Sequence[MappedModel]) -> int:
-        return sum(len(find_jumps(model, self.inliers)) for model in models)
+        with open_database(self.task.database) as database:
+            return sum(len(find_doubtful_jumps(model, self.inliers, database)) for model in models)
 
     def _denied_steps(self, model: MappedModel) -> list[int]:
         with open_database(self.task.database) as database:
@@ -324,3 +349,14 @@ class _Ladder:
     def _convert(self, models: dict[int, pycolmap.Reconstruction], method: str) -> list[MappedModel]:
         converted = [model_from_reconstruction(model, method) for model in models.values()]
         return [model for model in converted if len(model.images) >= self.min_images]
+
+
+def _from_pair(options: pycolmap.IncrementalPipelineOptions, pair: StartPair) -> pycolmap.IncrementalPipelineOptions:
+    """The options with the pair to start from, and with demands on it that it meets."""
+    options.init_image_id1 = pair.first + 1
+    options.init_image_id2 = pair.second + 1
+    options.multiple_models = False  # every further model would start from the same pair
+    options.mapper.init_min_num_inliers = 50
+    options.mapper.init_min_tri_angle = min(ENOUGH_ANGLE_DEG, ANGLE_TOLERANCE * pair.angle_deg)
+    options.mapper.init_max_forward_motion = 1.0 if pair.forward else 0.95
+    return options

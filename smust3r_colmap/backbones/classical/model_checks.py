@@ -29,6 +29,8 @@ STRONG_PAIR_INLIERS = 30
 MIN_EXPLAINED_SHARE = 0.5
 """A relative pose that fewer of the pair's verified matches agree with is wrong (sound models: 0.57 at
 least; wrong ones, on a walk round a building: 0 to 0.44)."""
+AFFIRMED_SHARE = 0.8
+"""A turn that so many of the pair's verified matches agree with has happened, as at the end of a drone's strip."""
 MAX_EPIPOLAR_ERROR_PX = 4.0
 """COLMAP's own bound for an inlier of two views."""
 NEAR_STEPS = 2
@@ -74,23 +76,44 @@ def find_jumps(model: MappedModel, inliers: Mapping[Pair, int]) -> list[int]:
     standing apart is a turn above MAX_TURN_DEG, or a step above MAX_STEP_RATIO median steps and
     above MIN_JUMP_DEPTHS of the distance of what the first image sees.
     """
-    steps = []
-    for k, (first, second) in enumerate(pairwise(model.images)):
-        if second - first == 1 and inliers.get((first, second), 0) >= STRONG_PAIR_INLIERS:
-            steps.append(k)
-    if not steps:
-        return []
+    lengths = _step_lengths(model, inliers)
+    return [k for k in lengths if _turn_deg(model, k) > MAX_TURN_DEG or _is_too_far(model, k, lengths)]
+
+
+def _step_lengths(model: MappedModel, inliers: Mapping[Pair, int]) -> dict[int, float]:
+    """How far the camera moved after position k, for every k whose image and the next are certain neighbours."""
     centres = model.seg_from_cam[:, :, 3]
-    lengths = {k: float(np.linalg.norm(centres[k + 1] - centres[k])) for k in steps}
+    return {
+        k: float(np.linalg.norm(centres[k + 1] - centres[k]))
+        for k, (first, second) in enumerate(pairwise(model.images))
+        if second - first == 1 and inliers.get((first, second), 0) >= STRONG_PAIR_INLIERS
+    }
+
+
+def _turn_deg(model: MappedModel, k: int) -> float:
+    relative = model.seg_from_cam[k, :, :3].T @ model.seg_from_cam[k + 1, :, :3]
+    return float(np.degrees(np.arccos(np.clip((np.trace(relative) - 1) / 2, -1, 1))))
+
+
+def _is_too_far(model: MappedModel, k: int, lengths: Mapping[int, float]) -> bool:
     median = float(np.median(list(lengths.values())))
-    jumps = []
-    for k in steps:
-        relative = model.seg_from_cam[k, :, :3].T @ model.seg_from_cam[k + 1, :, :3]
-        turn_deg = np.degrees(np.arccos(np.clip((np.trace(relative) - 1) / 2, -1, 1)))
-        far = lengths[k] > MAX_STEP_RATIO * median and lengths[k] > MIN_JUMP_DEPTHS * _median_depth(model, k)
-        if turn_deg > MAX_TURN_DEG or far:
-            jumps.append(k)
-    return jumps
+    return lengths[k] > MAX_STEP_RATIO * median and lengths[k] > MIN_JUMP_DEPTHS * _median_depth(model, k)
+
+
+def find_doubtful_jumps(model: MappedModel, inliers: Mapping[Pair, int], database: pycolmap.Database) -> list[int]:
+    """The jumps but for turns that AFFIRMED_SHARE of the verified matches agree with.
+
+    Matches say nothing about the length of a step, so one that is too long stays in doubt.
+
+    Args:
+        inliers: verified matches by pair. database: with the keypoints and the two-view geometries.
+    """
+    lengths = _step_lengths(model, inliers)
+    return [
+        k
+        for k in find_jumps(model, inliers)
+        if _is_too_far(model, k, lengths) or explained_share(model, k, k + 1, database) < AFFIRMED_SHARE
+    ]
 
 
 def _median_depth(model: MappedModel, k: int) -> float:
