@@ -2,7 +2,7 @@
 
 Everything is pycolmap's: the triangulator, the adjustment, the filters. Priors of the camera centres keep
 the world's frame and scale, which pixels alone do not hold. Everything here runs in a child process.
-The next module to read is ``steps``.
+The next module to read is ``part_adjustment``.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ PRIOR_SIGMA = 0.01
 FUNCTION_TOLERANCE, ROUGH_TOLERANCE = 1e-5, 1e-4
 """Ceres stops when the cost changes by less: as good as running to the end, at a third of the cost; rough where
 another adjustment follows."""
+POINT_ITERATIONS = 10
+"""Of points alone, which are near where they belong."""
 LOSS_SCALE_PX = 1.0
 """Where the Cauchy loss begins to bend."""
 MIN_ANGLE_DEG = 1.5
@@ -35,9 +37,10 @@ ENOUGH_OBSERVATIONS = 15
 """Images with fewer are weak: their pose rests on too little to be adjusted."""
 MANY_OBSERVATIONS = 60
 """An image with so many longer tracks can do without points that only two images see."""
-MAX_COVISIBLE = 200
+MAX_COVISIBLE = 120
 """Images that share points with an image, in the mean, beyond which equations are solved iteratively: for 1,000 images
-round a table six times faster, to the same minimum; for a walk, of which few images share points, slower."""
+round a table six times faster, for 200 by a quarter, to the same minimum; for a walk, of which few images share
+points, slower."""
 _NO_ERROR_PX = 1e100
 """What COLMAP calls the error of a point that a camera has behind it is far beyond."""
 
@@ -264,6 +267,18 @@ def adjust_part(model: pycolmap.Reconstruction, images: Collection[int], *, max_
         config.add_image(image_id)
     options = _options(calibrated=True, max_iterations=max_iterations, threads=threads)
     return _solve(pycolmap.create_default_bundle_adjuster(options, config, model), f"{len(images)} images")
+
+
+def adjust_points(model: pycolmap.Reconstruction, *, threads: int) -> bool:
+    """All points to where their observations want them, with every camera fixed; returns as ``adjust``."""
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in sorted(model.reg_image_ids()):
+        config.add_image(image_id)
+    for frame_id in sorted(model.reg_frame_ids()):
+        config.set_constant_rig_from_world_pose(frame_id)
+    options = _options(calibrated=True, max_iterations=POINT_ITERATIONS, threads=threads)
+    options.ceres.solver_options.function_tolerance = ROUGH_TOLERANCE
+    return _solve(pycolmap.create_default_bundle_adjuster(options, config, model), "all points")
 
 
 def _options(*, calibrated: bool, max_iterations: int, threads: int) -> pycolmap.BundleAdjustmentOptions:

@@ -18,12 +18,13 @@ import pycolmap
 
 from smust3r_colmap.products import FloatArray
 from smust3r_colmap.refinement.adjustment import Priors, adjust
+from smust3r_colmap.refinement.part_adjustment import part_of
 
 logger = logging.getLogger(__name__)
 
 MIN_IMAGES = 8
 """Of each camera; fewer do not determine a principal point."""
-OBSERVATIONS, MIN_OBSERVATIONS_PER_IMAGE = 60_000, 150
+OBSERVATIONS, MIN_OBSERVATIONS_PER_IMAGE = 40_000, 150
 """Of each half: as many as are quick to adjust, spread over the images, but of each image some."""
 MAX_SHIFT = 0.025
 """As a part of the longer image side; real cameras stay within a percent or two."""
@@ -63,9 +64,10 @@ def ask_for_principal_points(model: pycolmap.Reconstruction, priors: Priors, *, 
     if poor:
         return PrincipalPointAnswer(xy_img={}, reason=f"camera {poor[0]} has {counts[poor[0]]} of {MIN_IMAGES} images")
     loose = replace(priors, sigma=LOOSE * priors.sigma)
+    enough = max(OBSERVATIONS // model.num_reg_images(), MIN_OBSERVATIONS_PER_IMAGE)
     halves = []
     for half in (0, 1):
-        part = _part_of(model, half)
+        part = part_of(model, observations_per_image=enough, first=half, step=2)
         if not adjust(
             part, loose, calibrated=False, principal_point=True, max_iterations=MAX_ITERATIONS, threads=threads
         ):
@@ -93,21 +95,3 @@ def _why_not(camera: pycolmap.Camera, first: FloatArray, second: FloatArray) -> 
 
 def _principal_point(camera: pycolmap.Camera) -> FloatArray:
     return np.array([camera.principal_point_x, camera.principal_point_y])
-
-
-def _part_of(model: pycolmap.Reconstruction, half: int) -> pycolmap.Reconstruction:
-    """A copy with every other point, the longest tracks first, until each image has enough."""
-    part = pycolmap.Reconstruction(model)
-    points = sorted(model.points3D.items(), key=lambda item: (-item[1].track.length(), item[0]))
-    enough = max(OBSERVATIONS // model.num_reg_images(), MIN_OBSERVATIONS_PER_IMAGE)
-    seen: dict[int, int] = {}
-    chosen = set()
-    for point_id, point in points[half::2]:
-        images = [element.image_id for element in point.track.elements]
-        if any(seen.get(image_id, 0) < enough for image_id in images):
-            chosen.add(point_id)
-            for image_id in images:
-                seen[image_id] = seen.get(image_id, 0) + 1
-    for point_id in model.point3D_ids() - chosen:
-        part.delete_point3D(point_id)
-    return part

@@ -62,6 +62,7 @@ from smust3r_colmap.refinement.feature_matches import (
     ask_consent,
     read_matched_features,
 )
+from smust3r_colmap.refinement.part_adjustment import adjust_on_part
 from smust3r_colmap.refinement.pointmap_matches import MappedView, match_by_pointmaps
 from smust3r_colmap.refinement.principal_point import ask_for_principal_points
 from smust3r_colmap.refinement.replacement import NAME as REPLACEMENT
@@ -79,11 +80,11 @@ FIRST_ITERATIONS, SECOND_ITERATIONS, LAST_ITERATIONS, PART_ITERATIONS = 12, 30, 
 """Upper bounds; after so many the figures stand still to three digits on the sets tried."""
 MAP_KEYPOINTS = 1000
 """Corners of an image that are followed by pointmaps."""
-MAX_LAST_ROUNDS, STILL_PERCENT = 4, 0.05
+MAX_LAST_ROUNDS, STILL_PERCENT = 4, 0.1
 """Filter and adjust again until no camera moves by more than this part of the path's extent: an image that wrong
 matches hold lets go of them one by one."""
 LARGE = 250
-"""Images beyond which parts are adjusted before the whole."""
+"""Images beyond which parts are adjusted before the whole, and cameras on a part of the points first."""
 STAYED = "kept where it was"
 MODEL_FOLDER, DATABASE_FILE = "model", "database.db"
 
@@ -287,8 +288,10 @@ def _adjustment(
     principal_point: bool = False,
     rough: bool = False,
 ) -> StepReport:
+    """All cameras and points; ``rough``ly, and of a large model on a part of the points, where another follows."""
+
     def step() -> bool:
-        return adjust(
+        return (adjust_on_part if rough and model.num_reg_images() > LARGE else adjust)(
             model,
             priors,
             calibrated=task.calibrated,

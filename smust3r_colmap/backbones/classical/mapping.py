@@ -35,7 +35,8 @@ from smust3r_colmap.backbones.classical.model_checks import (
     find_doubtful_jumps,
     find_hinges,
 )
-from smust3r_colmap.backbones.classical.start_pair import ENOUGH_ANGLE_DEG, StartPair, choose_start_pair
+from smust3r_colmap.backbones.classical.start_pair import ENOUGH_ANGLE_DEG, StartPair, choose_start_pairs
+from smust3r_colmap.backbones.classical.thinning import thin_matches
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import UnregisteredImage
 
@@ -49,7 +50,7 @@ MIN_PAIR_INLIERS = 15
 """Verified matches below which COLMAP does not use a pair."""
 NEAR_OFFSET = 4
 """Reach of the pairs that are left when the longer ones folded the model."""
-ANGLE_TOLERANCE = 0.7
+ANGLE_TOLERANCE = 0.3
 """Share of the chosen pair's angle that the mapper, which estimates it again by sampling, has to find."""
 MAX_MODELS = 6
 """Models that one attempt may start; what is left of a segment after so many is crumbs that cost minutes."""
@@ -224,17 +225,19 @@ class _Ladder:
         )
 
     def _from_chosen_pair(self, database: str, pairs: Sequence[Pair]) -> dict[int, pycolmap.Reconstruction]:
-        """One model from the best pair to start with; nothing where there is none."""
+        """One model from the best pair that gives one; nothing where none does."""
         camera_of = dict(zip(self.task.images, self.task.camera_indices, strict=True))
         cameras = {image: self.task.cameras[index] for image, index in camera_of.items()}
         with open_database(self.scratch / database) as opened:
-            pair = choose_start_pair(opened, pairs, cameras, seed=self.task.seed)
-        if pair is None:
-            return {}
-        models = self._run_incremental(database, database.replace(".db", "-chosen"), _from_pair(self._options(), pair))
-        if database == "segment.db" and models:
-            self.largest_output = self.scratch / "segment-chosen" / str(max(models))
-        return models
+            starts = choose_start_pairs(opened, pairs, cameras, seed=self.task.seed)
+        for number, start in enumerate(starts):
+            name = f"{database.removesuffix('.db')}-{number}"
+            models = self._run_incremental(database, name, _from_pair(self._options(), start))
+            if models:
+                if database == "segment.db":
+                    self.largest_output = self.scratch / name / str(max(models))
+                return models
+        return {}
 
     def _incremental(self, *, start: Path | None = None) -> dict[int, pycolmap.Reconstruction]:
         """Models with relaxed demands, continued from ``start`` or from pairs that COLMAP finds."""
@@ -326,7 +329,6 @@ class _Ladder:
     # ------------------------------------------------------------------- plumbing
     def _build_database(self, name: str, pairs: Sequence[Pair]) -> dict[Pair, int]:
         """A database of this segment alone, with the cameras to start from; inliers by pair."""
-        inliers = {}
         path = self.scratch / name
         path.unlink(missing_ok=True)
         with (
@@ -335,15 +337,20 @@ class _Ladder:
             pycolmap.DatabaseTransaction(own),
         ):
             write_images(own, self.task.cameras, zip(self.task.images, self.task.camera_indices, strict=True))
+            num_features = {}
             for image in self.task.images:
                 if run.exists_keypoints(image + 1):
-                    own.write_keypoints(image + 1, run.read_keypoints(image + 1))
-            for first, second in pairs:
-                geometry = run.read_two_view_geometry(first + 1, second + 1)
-                inliers[first, second] = len(geometry.inlier_matches)
-                if len(geometry.inlier_matches):
-                    own.write_matches(first + 1, second + 1, geometry.inlier_matches)
-                    own.write_two_view_geometry(first + 1, second + 1, geometry)
+                    keypoints = run.read_keypoints(image + 1)
+                    own.write_keypoints(image + 1, keypoints)
+                    num_features[image] = len(keypoints)
+            geometries = {(first, second): run.read_two_view_geometry(first + 1, second + 1) for first, second in pairs}
+            inliers = {pair: len(geometry.inlier_matches) for pair, geometry in geometries.items()}
+            kept = thin_matches({pair: geometry.inlier_matches for pair, geometry in geometries.items()}, num_features)
+            for (first, second), matches in kept.items():
+                geometry = geometries[first, second]
+                geometry.inlier_matches = matches
+                own.write_matches(first + 1, second + 1, matches)
+                own.write_two_view_geometry(first + 1, second + 1, geometry)
         return inliers
 
     def _convert(self, models: dict[int, pycolmap.Reconstruction], method: str) -> list[MappedModel]:
@@ -356,6 +363,7 @@ def _from_pair(options: pycolmap.IncrementalPipelineOptions, pair: StartPair) ->
     options.init_image_id1 = pair.first + 1
     options.init_image_id2 = pair.second + 1
     options.multiple_models = False  # every further model would start from the same pair
+    options.init_num_trials = 1  # and so would every further trial
     options.mapper.init_min_num_inliers = 50
     options.mapper.init_min_tri_angle = min(ENOUGH_ANGLE_DEG, ANGLE_TOLERANCE * pair.angle_deg)
     options.mapper.init_max_forward_motion = 1.0 if pair.forward else 0.95

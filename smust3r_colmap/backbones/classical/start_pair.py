@@ -1,4 +1,4 @@
-"""The two images from which the incremental mapper starts.
+"""The pairs of images from which the incremental mapper starts.
 
 COLMAP's own search begins with the pairs that share most matches. In a sequence these are neighbours,
 which hardly see around anything, so it estimates hundreds of pairs before one passes, lowers its demands
@@ -29,6 +29,8 @@ ENOUGH_PARALLAX_DEG = 4.0
 """Median parallax beyond which a pair is not better for having more; its matches only get fewer."""
 MAX_ESTIMATED = 12
 """Best-ranked pairs whose relative pose is estimated."""
+MAX_STARTS = 3
+"""Pairs to try until one gives a model."""
 ENOUGH_ANGLE_DEG = 16.0
 """Median angle between the rays to a point at which no further pair is tried (COLMAP's ``init_min_tri_angle``)."""
 FORWARD_MOTION = 0.9
@@ -47,10 +49,10 @@ class StartPair:
     forward: bool
 
 
-def choose_start_pair(
+def choose_start_pairs(
     database: pycolmap.Database, pairs: Sequence[Pair], cameras: Mapping[int, Intrinsics], *, seed: int
-) -> StartPair | None:
-    """The best of the pairs, or none if no pair has MIN_INLIERS verified matches and a relative pose.
+) -> tuple[StartPair, ...]:
+    """At most MAX_STARTS of the pairs, best first; none if none has MIN_INLIERS verified matches and a relative pose.
 
     Args:
         database: with keypoints and two-view geometries; image ids are index + 1.
@@ -70,7 +72,7 @@ def choose_start_pair(
         parallax_deg = _parallax_deg(rays[pair[0]][matches[:, 0]], rays[pair[1]][matches[:, 1]])
         ranked.append((len(matches) * min(parallax_deg / ENOUGH_PARALLAX_DEG, 1.0), pair, matches))
     ranked.sort(key=lambda row: (-row[0], row[1]))
-    best, best_value = None, 0.0
+    valued: list[tuple[float, StartPair]] = []
     for _, (first, second), matches in ranked[:MAX_ESTIMATED]:
         geometry = pycolmap.estimate_calibrated_two_view_geometry(
             cameras[first].colmap_camera(1),
@@ -85,12 +87,11 @@ def choose_start_pair(
         angle_deg = float(np.degrees(geometry.tri_angle))
         forward = abs(geometry.cam2_from_cam1.translation[2]) > FORWARD_MOTION
         value = angle_deg * (FORWARD_VALUE if forward else 1.0)
-        if value > best_value:
-            best_value = value
-            best = StartPair(first=first, second=second, angle_deg=angle_deg, forward=forward)
-        if best_value >= ENOUGH_ANGLE_DEG:
+        valued.append((value, StartPair(first=first, second=second, angle_deg=angle_deg, forward=forward)))
+        if value >= ENOUGH_ANGLE_DEG:
             break
-    return best
+    valued.sort(key=lambda row: -row[0])
+    return tuple(pair for _, pair in valued[:MAX_STARTS])
 
 
 def _parallax_deg(rays_first: FloatArray, rays_second: FloatArray) -> float:
