@@ -15,7 +15,7 @@ import pytest
 from scenes import CAMERA, make_piece, points_ahead, rotation_about_y, walk
 
 from smust3r_colmap.backbones.classical import backbone as backbone_module
-from smust3r_colmap.backbones.classical import calibration
+from smust3r_colmap.backbones.classical import calibration, mapping
 from smust3r_colmap.backbones.classical import features as features_module
 from smust3r_colmap.backbones.classical.backbone import ClassicalBackbone
 from smust3r_colmap.backbones.classical.calibration import (
@@ -40,10 +40,12 @@ from smust3r_colmap.backbones.classical.model_checks import (
     diverged_focal,
     epipolar_errors_px,
     find_denied_steps,
+    find_doubtful_jumps,
     find_hinges,
     find_jumps,
     near_positions,
 )
+from smust3r_colmap.backbones.classical.start_pair import StartPair
 from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
 from smust3r_colmap.config import ClassicalConfig
 from smust3r_colmap.errors import StorageError
@@ -287,10 +289,29 @@ def test_a_model_that_its_matches_deny_is_broken_at_that_step(
     inliers = dict.fromkeys(task.pairs, 200)
     with open_database(task.database) as database:
         assert find_jumps(model, inliers)
+        assert find_doubtful_jumps(model, inliers, database) == []
         assert find_denied_steps(model, inliers, database) == []
         model.seg_from_cam[5:, :, :3] = model.seg_from_cam[5:, :, :3] @ rotation_about_y(25.0)
         assert 4 in find_denied_steps(model, inliers, database)
         assert not {0, 1, 2} & set(find_denied_steps(model, inliers, database))
+        model.seg_from_cam[5:, :, :3] = model.seg_from_cam[5:, :, :3] @ rotation_about_y(90.0)
+        assert find_doubtful_jumps(model, inliers, database) == [4]
+        model.seg_from_cam[2:, 0, 3] += 1000.0
+        assert 1 in find_doubtful_jumps(model, inliers, database), "matches say nothing of the length of a step"
+
+
+def test_a_start_that_gives_no_model_is_followed_by_the_next(
+    synthetic: tuple[MappingTask, pycolmap.Reconstruction], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task, _ = synthetic
+    without = StartPair(first=0, second=1, angle_deg=20.0, forward=False)
+    sound = StartPair(first=2, second=4, angle_deg=20.0, forward=False)
+    monkeypatch.setattr(mapping, "choose_start_pairs", lambda *_, **__: (without, sound))
+    mapped = map_segment(replace(task, pairs=tuple(pair for pair in task.pairs if pair != (0, 1))))
+    assert mapped.attempts == ("incremental: 8 of 8 images",)
+    monkeypatch.setattr(mapping, "choose_start_pairs", lambda *_, **__: ())
+    mapped = map_segment(task)
+    assert mapped.attempts == ("incremental: 0 of 8 images", "incremental, relaxed start: 8 of 8 images")
 
 
 # ---------------------------------------------------------------------- calibration

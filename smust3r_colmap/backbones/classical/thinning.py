@@ -36,16 +36,17 @@ def thin_matches(matches: Mapping[Pair, Matches], num_features: Mapping[int, int
     """
     pairs_of_feature = {image: np.zeros(number, dtype=np.int64) for image, number in num_features.items()}
     needed = {image: np.zeros(number, dtype=bool) for image, number in num_features.items()}
+    matches = {pair: rows for pair, rows in matches.items() if len(rows)}
     for pair, rows in matches.items():
         for side, image in enumerate(pair):
-            pairs_of_feature.setdefault(image, np.zeros(0, dtype=np.int64))[rows[:, side]] += 1
+            pairs_of_feature[image][rows[:, side]] += 1
             if len(rows) < WEAK_PAIR_MATCHES:
                 needed[image][rows[:, side]] = True
     enough = max(ENOUGH_FEATURES, ENOUGH_IN_SEGMENT // max(len(num_features), 1))
     kept = {image: needed[image] | _is_among_most(counts, enough) for image, counts in pairs_of_feature.items()}
     thinned = {}
     for (first, second), rows in matches.items():
-        stays = kept[first][rows[:, 0]] & kept[second][rows[:, 1]] if len(rows) else np.zeros(0, dtype=bool)
+        stays = kept[first][rows[:, 0]] & kept[second][rows[:, 1]]
         if stays.any():
             thinned[first, second] = rows[stays]
     return thinned
