@@ -2,7 +2,7 @@
 
 Poses need a few hundred observations of each image; where an image has thousands, the rest costs time and
 says the same again. So where another adjustment follows, cameras are adjusted on the longest tracks, and then
-all points with the cameras fixed, each by itself. The next module to read is ``steps``.
+all points with the cameras fixed, each by itself. The next module to read is ``principal_point``.
 """
 
 from __future__ import annotations

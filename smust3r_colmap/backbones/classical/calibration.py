@@ -3,7 +3,7 @@
 Self-calibration inside a short segment is weak: focal lengths of neighbouring segments differ by
 some percent, and now and then one diverges (853 px for 525). Segments whose cameras differ do not
 fit together by any similarity. So the run agrees on one set of intrinsics per camera, and every
-model is adjusted to it. A model that had diverged is mapped again from the agreed values.
+model is adjusted to it. A model that had diverged is mapped again under the agreed values.
 The next module to read is ``dense``.
 """
 
@@ -90,8 +90,11 @@ def calibrate_segment(task: CalibrationTask) -> MappedSegment:
     if len(placed) >= ENOUGH_REGISTERED * len(task.mapping.images):
         mapped = replace(mapped, models=tuple(sound), unregistered=left_over(task.mapping, sound, mapped.unregistered))
     elif len(sound) < len(mapped.models):
-        start = tuple(task.agreed.get(index, camera) for index, camera in enumerate(task.mapping.cameras))
-        again = map_segment(replace(task.mapping, cameras=start, trusted_focal=trusted))
+        # Without a prior COLMAP estimates the focal length with the first pose, whatever else is held.
+        agreed = {index: replace(camera, has_prior_focal=True) for index, camera in task.agreed.items()}
+        start = tuple(agreed.get(index, camera) for index, camera in enumerate(task.mapping.cameras))
+        all_agreed = trusted.keys() >= set(task.mapping.camera_indices)  # then nothing can diverge again
+        again = map_segment(replace(task.mapping, cameras=start, trusted_focal=trusted, calibrated=all_agreed))
         attempts = (*mapped.attempts, "focal length off the run's: mapped again", *again.attempts)
         if len(placed_images(again.models)) < len(placed):
             left = left_over(task.mapping, sound, again.unregistered)

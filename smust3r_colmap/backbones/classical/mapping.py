@@ -264,8 +264,8 @@ class _Ladder:
         options.ba_global_max_refinements = 2
         options.ba_global_frames_ratio = 1.4
         options.ba_global_points_ratio = 1.4
-        options.ba_refine_focal_length = not self.task.calibrated
-        options.ba_refine_extra_params = not self.task.calibrated
+        options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not self.task.calibrated
+        options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = not self.task.calibrated
         options.mapper.num_threads = 1
         options.mapper.random_seed = self.task.seed
         options.triangulation.random_seed = self.task.seed
