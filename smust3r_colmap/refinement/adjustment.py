@@ -8,7 +8,7 @@ The next module to read is ``part_adjustment``.
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,6 +31,9 @@ LOSS_SCALE_PX = 1.0
 """Where the Cauchy loss begins to bend."""
 MIN_ANGLE_DEG = 1.5
 """Of the rays of a point; COLMAP's own."""
+TRANSITIVITY = 2
+"""Matches of matches are correspondences, too. With one step tracks begin in many pieces, and merging these took 170 of
+190 s for 1,000 images; with three, beginning them takes as long as that saves. The tracks are the same."""
 MIN_PRIORS = 3
 """Camera centres that hold a frame; fewer leave it turning."""
 ENOUGH_OBSERVATIONS = 15
@@ -100,6 +103,7 @@ def triangulator_options(tolerance: Tolerance) -> pycolmap.IncrementalTriangulat
     options.merge_max_reproj_error = tolerance.pixels
     options.complete_max_reproj_error = tolerance.pixels
     options.min_angle = MIN_ANGLE_DEG
+    options.max_transitivity = options.complete_max_transitivity = TRANSITIVITY
     options.random_seed = 0
     return options
 
@@ -111,7 +115,7 @@ def triangulate(mapper: pycolmap.IncrementalMapper, tolerance: Tolerance) -> Non
     """
     options = triangulator_options(tolerance)
     model = mapper.reconstruction
-    for image_id in sorted(model.reg_image_ids()):
+    for image_id in _far_apart_first(sorted(model.reg_image_ids())):
         mapper.triangulate_image(options, image_id)
     mapper.retriangulate(options)
     mapper.complete_and_merge_tracks(options)
@@ -119,6 +123,12 @@ def triangulate(mapper: pycolmap.IncrementalMapper, tolerance: Tolerance) -> Non
     for image_id in sorted(model.reg_image_ids()):
         if model.image(image_id).num_points3D < MANY_OBSERVATIONS:
             mapper.triangulate_image(options, image_id)
+
+
+def _far_apart_first(ids: Sequence[int]) -> list[int]:
+    """Halves, quarters, eighths: the order of the reversed bits. Images in a row would all begin the same tracks."""
+    digits = len(ids).bit_length()
+    return [ids[k] for k in sorted(range(len(ids)), key=lambda k: format(k, f"0{digits}b")[::-1])]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

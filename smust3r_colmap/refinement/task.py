@@ -80,7 +80,7 @@ FIRST_ITERATIONS, SECOND_ITERATIONS, LAST_ITERATIONS, PART_ITERATIONS = 12, 30, 
 """Upper bounds; after so many the figures stand still to three digits on the sets tried."""
 MAP_KEYPOINTS = 1000
 """Corners of an image that are followed by pointmaps."""
-MAX_LAST_ROUNDS, STILL_PERCENT = 4, 0.1
+MAX_LAST_ROUNDS, STILL_PERCENT = 4, 0.2
 """Filter and adjust again until no camera moves by more than this part of the path's extent: an image that wrong
 matches hold lets go of them one by one."""
 LARGE = 250
