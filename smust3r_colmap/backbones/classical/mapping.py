@@ -35,7 +35,7 @@ from smust3r_colmap.backbones.classical.model_checks import (
     find_doubtful_jumps,
     find_hinges,
 )
-from smust3r_colmap.backbones.classical.start_pair import ENOUGH_ANGLE_DEG, StartPair, choose_start_pairs
+from smust3r_colmap.backbones.classical.start_pair import ENOUGH_ANGLE_DEG, MIN_INLIERS, StartPair, choose_start_pairs
 from smust3r_colmap.backbones.classical.thinning import thin_matches
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import UnregisteredImage
@@ -364,7 +364,7 @@ def _from_pair(options: pycolmap.IncrementalPipelineOptions, pair: StartPair) ->
     options.init_image_id2 = pair.second + 1
     options.multiple_models = False  # every further model would start from the same pair
     options.init_num_trials = 1  # and so would every further trial
-    options.mapper.init_min_num_inliers = 50
+    options.mapper.init_min_num_inliers = MIN_INLIERS
     options.mapper.init_min_tri_angle = min(ENOUGH_ANGLE_DEG, ANGLE_TOLERANCE * pair.angle_deg)
     options.mapper.init_max_forward_motion = 1.0 if pair.forward else 0.95
     return options

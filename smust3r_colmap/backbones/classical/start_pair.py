@@ -2,9 +2,9 @@
 
 COLMAP's own search begins with the pairs that share most matches. In a sequence these are neighbours,
 which hardly see around anything, so it estimates hundreds of pairs before one passes, lowers its demands
-and begins again: half of the cost of a segment. It also starts where it can and not where it is best,
+and begins again: up to half of the cost of a segment. It also starts where it can and not where it is best,
 and a model from a weak start, with a guessed focal length, collapses after dozens of images. Here all
-pairs are ranked by a parallax that costs nothing, and only the best are estimated.
+pairs are ranked by a parallax that costs little, and only the best are estimated.
 The next module to read is ``mapping``.
 """
 

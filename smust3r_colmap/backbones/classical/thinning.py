@@ -53,7 +53,7 @@ def thin_matches(matches: Mapping[Pair, Matches], num_features: Mapping[int, int
 
 
 def _is_among_most(counts: npt.NDArray[np.int64], number: int) -> npt.NDArray[np.bool_]:
-    """(F,) True for the ``number`` largest counts; of equals the first, which are the larger features."""
+    """(F,) True for the ``number`` largest counts; of equals the first."""
     among = np.zeros(len(counts), dtype=bool)
     among[np.argsort(-counts, kind="stable")[:number]] = True
     return among
