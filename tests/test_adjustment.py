@@ -44,6 +44,7 @@ from smust3r_colmap.refinement.adjustment import (
     mean_covisible,
     pose_priors,
     priors_of,
+    robust_cost,
     triangulate,
     weak_images,
 )
@@ -151,6 +152,26 @@ def test_equations_solved_iteratively_lead_to_the_same_minimum(
     direct, iterative = found
     np.testing.assert_allclose(iterative, direct, atol=1e-3)
     assert not np.array_equal(iterative, direct)
+
+
+def test_cost_is_the_cauchy_loss_of_what_lies_in_front_of_its_cameras(round_a_ball: Bench) -> None:
+    model, _ = round_a_ball.model(disturbed_around_the_truth(round_a_ball.world, np.random.default_rng(1)))
+    first = model.image(1)
+    behind = next(point.point3D_id for point in first.get_observation_points2D())
+    model.point3D(behind).xyz = first.projection_center() - first.viewing_direction()
+    expected, unseen = 0.0, 0
+    for point in model.points3D.values():
+        for element in point.track.elements:
+            image = model.image(element.image_id)
+            pixel = image.project_point(point.xyz)
+            if pixel is None:
+                unseen += 1
+            else:
+                expected += np.log1p(np.sum((pixel - image.point2D(element.point2D_idx).xy) ** 2))
+    assert unseen > 0
+    assert expected > 100
+    assert robust_cost(model) == pytest.approx(expected, rel=1e-9)
+    assert robust_cost(pycolmap.Reconstruction()) == 0
 
 
 def test_covisibility_counts_the_images_that_share_points_with_an_image() -> None:
