@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pycolmap
 import pytest
 from tracked_scenes import (
@@ -181,9 +182,9 @@ def test_one_thread_answers_the_same_twice(courtyard: Asked) -> None:
 
 @pytest.mark.parametrize("seed", [2, 3, 4])
 def test_middle_stays_the_middle(seed: int) -> None:
-    """Noise moves both halves a little, and each to another place."""
+    """Noise saves next to nothing by moving it."""
     answer = from_many_sides(np.zeros(2), seed=seed, num_points=500).ask()
-    assert 0 < np.linalg.norm(answer.xy_img[1] - MIDDLE) < 2e-3 * CAMERA.width
+    assert np.linalg.norm(answer.xy_img[1] - MIDDLE) < 2e-3 * CAMERA.width
     left_at = MIDDLE if answer.reason else answer.xy_img[1]
     assert np.linalg.norm(left_at - MIDDLE) < 1e-3 * CAMERA.width
 
@@ -211,7 +212,7 @@ def test_errors_of_the_priors_are_no_agreement(seed: int) -> None:
     assert re.fullmatch(NO_GAIN, answer.reason), answer.reason
 
 
-def decentred(keypoints: FloatArray, p1: float) -> FloatArray:
+def decentred(keypoints: npt.NDArray[np.floating], p1: float) -> FloatArray:
     """(K, 2) image positions as a lens draws them that is tilted: Brown's tangential term, which our cameras lack."""
     x, y = ((keypoints - MIDDLE) / CAMERA.params[0]).T
     return keypoints + CAMERA.params[0] * p1 * np.column_stack([2 * x * y, x * x + 3 * y * y])
@@ -228,11 +229,11 @@ def test_what_the_camera_model_lacks_is_no_principal_point(seed: int, monkeypatc
     tilted = tuple(decentred(keypoints, 1e-3).astype(np.float32) for keypoints in world.keypoints)
     street = adjusted(replace(world, keypoints=tilted), rng, distortion=0.0)
     answer = street.ask()
-    assert re.fullmatch(r"another place would save only 0\.[0-7]\d % of the cost", answer.reason), answer.reason
+    assert re.fullmatch(r"another place would save only 0\.[0-5]\d % of the cost", answer.reason), answer.reason
 
     monkeypatch.setattr(principal_point, "MIN_GAIN", -1.0)
     fallen_for = street.ask()
-    assert np.linalg.norm(fallen_for.xy_img[1] - MIDDLE) > 1
+    assert np.linalg.norm(fallen_for.xy_img[1] - MIDDLE) > 0.8
     assert fallen_for.reason == ""
 
 
@@ -325,11 +326,11 @@ def test_halves_may_differ_by_half_of_the_shift(
         np.testing.assert_allclose(answer.xy_img[1] - MIDDLE, [(first + second) / 2, 0], atol=1e-9)
 
 
-@pytest.mark.parametrize(("second", "accepted"), [(99.1, True), (99.3, False), (np.nan, False)])
+@pytest.mark.parametrize(("second", "accepted"), [(99.3, True), (99.5, False), (np.nan, False)])
 def test_each_half_must_save_something(
     courtyard: Asked, monkeypatch: pytest.MonkeyPatch, second: float, accepted: bool
 ) -> None:
-    assert 0.007 < MIN_GAIN < 0.009
+    assert 0.005 < MIN_GAIN < 0.007
     costs = iter([100.0, 98.0, 100.0, second])
     monkeypatch.setattr(principal_point, "robust_cost", lambda _: next(costs))
     assert (courtyard.ask().reason == "") == accepted

@@ -22,8 +22,8 @@ logger = logging.getLogger(__name__)
 
 PRIOR_SIGMA = 0.01
 """Standard deviation of a prior camera centre, as a part of the path's extent: what stitching usually leaves."""
-FUNCTION_TOLERANCE, ROUGH_TOLERANCE = 1e-5, 1e-3
-"""Ceres stops when the cost changes by less: as good as running to the end, at a third of the cost; rough where
+FUNCTION_TOLERANCE, ROUGH_TOLERANCE = 1e-4, 1e-3
+"""Ceres stops when the cost changes by less: as good as running to the end, at a quarter of the cost; rough where
 another adjustment follows, which is repeated until the cameras stand still."""
 POINT_ITERATIONS = 10
 """Of points alone, which are near where they belong."""
@@ -242,7 +242,7 @@ def robust_cost(model: pycolmap.Reconstruction) -> float:
             continue
         xyz_world = np.stack([model.point3D(point.point3D_id).xyz for point in seen])
         projected = model.camera(image.camera_id).img_from_cam(image.cam_from_world() * xyz_world)
-        errors = np.linalg.norm(projected - np.stack([point.xy for point in seen]), axis=1)
+        errors = np.linalg.norm(np.asarray(projected) - np.stack([point.xy for point in seen]), axis=1)
         cost += float(np.nansum(np.log1p((errors / LOSS_SCALE_PX) ** 2))) * LOSS_SCALE_PX**2
     return cost
 

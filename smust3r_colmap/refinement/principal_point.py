@@ -34,7 +34,7 @@ MAX_SHIFT = 0.025
 """As a part of the longer image side; real cameras stay within a percent or two."""
 AGREEMENT = 0.5
 """Part of the shift by which the two halves may differ: four standard deviations of their mean."""
-MIN_GAIN = 0.008
+MIN_GAIN = 0.006
 """Part of the cost that the shift must save in each half: less may make up for what the camera model lacks."""
 LOOSE = 100.0
 """Times the standard deviation of the priors: they hold frame and scale, and say nothing of a principal point."""

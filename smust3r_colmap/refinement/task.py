@@ -440,11 +440,10 @@ def _put_back_weak_images(model: pycolmap.Reconstruction, stitched: Mapping[int,
 
 def _colour(model: pycolmap.Reconstruction, collection: ImageCollection) -> None:
     """The mean colour of each point's observations, read from the upright images."""
-    sums: dict[int, FloatArray] = {}
-    counts: dict[int, int] = {}
+    point_ids: list[int] = []
+    colours: list[FloatArray] = []
     for image_id in sorted(model.reg_image_ids()):
-        image = model.image(image_id)
-        seen = [(point.point3D_id, point.xy) for point in image.points2D if point.has_point3D()]
+        seen = model.image(image_id).get_observation_points2D()
         if not seen:
             continue
         try:
@@ -452,14 +451,18 @@ def _colour(model: pycolmap.Reconstruction, collection: ImageCollection) -> None
         except ImageError as error:
             logger.warning("its points are coloured by other images: %s", error)
             continue
-        xy = np.array([place for _, place in seen])
+        xy = np.stack([point.xy for point in seen])
         column = np.clip(xy[:, 0].astype(np.int64), 0, rgb.shape[1] - 1)
         row = np.clip(xy[:, 1].astype(np.int64), 0, rgb.shape[0] - 1)
-        for (point_id, _), colour in zip(seen, rgb[row, column].astype(np.float64), strict=True):
-            sums[point_id] = sums.get(point_id, 0.0) + colour
-            counts[point_id] = counts.get(point_id, 0) + 1
-    for point_id, total in sums.items():
-        model.point3D(point_id).color = np.round(total / counts[point_id]).astype(np.uint8)
+        colours.append(rgb[row, column].astype(np.float64))
+        point_ids += [point.point3D_id for point in seen]
+    if not colours:
+        return
+    ids, rows, counts = np.unique(point_ids, return_inverse=True, return_counts=True)
+    sums = np.zeros((len(ids), 3))
+    np.add.at(sums, rows, np.concatenate(colours))
+    for point_id, colour in zip(ids.tolist(), np.round(sums / counts[:, None]).astype(np.uint8), strict=True):
+        model.point3D(point_id).color = colour
 
 
 # ------------------------------------------------------------------------- helpers

@@ -159,9 +159,9 @@ def reconstruction_from_model(model: MappedModel, task: CalibrationTask) -> pyco
         reconstruction.add_camera_with_trivial_rig(task.agreed.get(camera, own).colmap_camera(camera + 1))
     with open_database(mapping.database) as database:
         for k, index in enumerate(model.images):
-            image = pycolmap.Image(name=internal_name(index), camera_id=camera_of[index] + 1, image_id=index + 1)
             xy_img = np.asarray(database.read_keypoints(index + 1), dtype=np.float64)[:, :2]
-            image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in xy_img])
+            name, camera_id = internal_name(index), camera_of[index] + 1
+            image = pycolmap.Image(name=name, keypoints=xy_img, camera_id=camera_id, image_id=index + 1)
             cam_from_seg = pycolmap.Rigid3d(invert_rigid(model.seg_from_cam[k]))
             reconstruction.add_image_with_trivial_frame(image, cam_from_seg)
     tracks = model.tracks
