@@ -113,14 +113,12 @@ def ask_consent(features: MatchedFeatures, views: Mapping[int, View], *, toleran
             if verified is not None and len(verified) >= MIN_VERIFIED:
                 kept[pair] = verified
             continue
-        if verified is not None:
-            consent = float(_on_epipolar_lines(pair, verified, seen, tolerance).mean())
-            if consent < MIN_CONSENT:
-                refused[pair] = consent
-                continue
         # What verification left out of a pair is mostly wrong by little, and bends the model.
         matches = raw if verified is None else verified
         good = _on_epipolar_lines(pair, matches, seen, tolerance)
+        if verified is not None and good.mean() < MIN_CONSENT:
+            refused[pair] = float(good.mean())
+            continue
         # Without verification, chance puts a few matches on their lines, but not so many of all.
         if good.sum() >= MIN_MATCHES and good.mean() >= MIN_CONSENT:
             kept[pair] = matches[good]

@@ -131,7 +131,7 @@ def _adjust(model: MappedModel, task: CalibrationTask) -> tuple[MappedModel, str
     options.refine_extra_params = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.num_threads = 1
-    options.ceres.solver_options.function_tolerance = 1e-5
+    options.ceres.solver_options.function_tolerance = 1e-4
     options.ceres.solver_options.max_num_iterations = 50
     pycolmap.bundle_adjustment(reconstruction, options)
     observations = pycolmap.ObservationManager(reconstruction)
