@@ -197,7 +197,7 @@ class RefinementConfig:
     """Images that each image is matched with for tracks, chosen by how much of the same surface the stitched
     geometry says they see; the pairs that the segments have matched already cost nothing more."""
     principal_point: bool = True
-    """Let the principal point leave the middle where two halves of the points agree where it is and fit better there."""
+    """Let the principal point leave the middle where two halves of the points agree on a place and fit better there."""
     complete: bool = False
     """Let COLMAP's incremental mapper try the images that got no pose, on the adjusted model."""
 

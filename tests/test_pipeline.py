@@ -16,6 +16,8 @@ import pytest
 import trimesh
 from read_colmap_independently import read_binary
 
+from smust3r_colmap.backbones.classical import backbone
+from smust3r_colmap.backbones.classical.mapping import METHOD_VERSION
 from smust3r_colmap.config import (
     AlignmentConfig,
     ClassicalConfig,
@@ -198,6 +200,15 @@ def test_a_changed_setting_redoes_its_stage_and_what_follows(
     assert not again["fusion"]
     assert again["depth"]
     assert again["alignment"]
+
+
+def test_segments_of_another_version_are_mapped_again(
+    brief: RunSummary, brief_walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(brief.output, tmp_path / "out")
+    monkeypatch.setattr(backbone, "METHOD_VERSION", METHOD_VERSION + 1)
+    again = reused(run(brief_walk, tmp_path / "out", BRIEF))
+    assert (again["features"], again["matching"], again["mapping"], again["calibration"]) == (True, True, False, False)
 
 
 def test_renamed_images_have_their_new_names_in_the_model(brief: RunSummary, brief_walk: Path, tmp_path: Path) -> None:

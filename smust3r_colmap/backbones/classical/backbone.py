@@ -22,7 +22,7 @@ from smust3r_colmap.backbones.classical.features import (
     plan_loop_pairs,
     plan_pairs,
 )
-from smust3r_colmap.backbones.classical.mapping import MappedSegment, MappingTask, map_segment
+from smust3r_colmap.backbones.classical.mapping import METHOD_VERSION, MappedSegment, MappingTask, map_segment
 from smust3r_colmap.backbones.classical.run_features import describe_images, features_of_run
 from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
 from smust3r_colmap.config import ClassicalConfig
@@ -141,7 +141,8 @@ class ClassicalBackbone:
         """
         tasks = [self._mapping_task(segment, pairs[segment.index]) for segment in segments]
         fixed = ("calibrated",) if self.collection.calibrated else ()
-        keys = [key_of("mapping", self._features.key, task.images, task.pairs, self.seed, *fixed) for task in tasks]
+        inputs = (self._features.key, self.seed, *fixed)
+        keys = [key_of("mapping", METHOD_VERSION, *inputs, task.images, task.pairs) for task in tasks]
         folders = [self._segment_stage(task.segment, "mapping", key) for task, key in zip(tasks, keys, strict=True)]
         with self.reporter.stage("mapping", total=len(tasks)) as stage:
             mapped = self._finish(map_segment, tasks, folders, [_nothing(task) for task in tasks], stage)

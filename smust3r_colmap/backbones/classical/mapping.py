@@ -52,6 +52,8 @@ NEAR_OFFSET = 4
 """Reach of the pairs that are left when the longer ones folded the model."""
 ANGLE_TOLERANCE = 0.3
 """Share of the chosen pair's angle that the mapper, which estimates it again by sampling, has to find."""
+METHOD_VERSION = 2
+"""To be raised when mapping or calibration change, so that finished segments are mapped again."""
 MAX_MODELS = 6
 """Models that one attempt may start; what is left of a segment after so many is crumbs that cost minutes."""
 
