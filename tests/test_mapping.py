@@ -314,6 +314,28 @@ def test_a_start_that_gives_no_model_is_followed_by_the_next(
     assert mapped.attempts == ("incremental: 0 of 8 images", "incremental, relaxed start: 8 of 8 images")
 
 
+@pytest.mark.parametrize(("links", "last"), [(2, "incremental, continued relaxed"), (3, "global")])
+def test_further_mappers_are_tried_only_where_enough_pairs_link_the_halves(
+    links: int, last: str, synthetic: tuple[MappingTask, pycolmap.Reconstruction], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both halves are placed, as two models: with a pair or two between them no mapper makes it one."""
+    task, _ = synthetic
+    across = [pair for pair in task.pairs if pair[0] < 4 <= pair[1]]
+    convert = mapping._Ladder._convert
+
+    def in_halves(self: mapping._Ladder, models: dict[int, pycolmap.Reconstruction], method: str) -> list[MappedModel]:
+        whole = max(convert(self, models, method), key=lambda model: len(model.images))
+        if method == "incremental":
+            return [restrict_model(whole, range(4))]
+        return [restrict_model(whole, half) for half in (range(4), range(4, 8))]
+
+    monkeypatch.setattr(mapping._Ladder, "_convert", in_halves)
+    mapped = map_segment(replace(task, pairs=tuple(pair for pair in task.pairs if pair not in across[links:])))
+    assert [len(model.images) for model in mapped.models] == [4, 4]
+    assert mapped.attempts[0] == "incremental: 4 of 8 images"
+    assert mapped.attempts[-1] == f"{last}: 4 + 4 of 8 images"
+
+
 # ---------------------------------------------------------------------- calibration
 def test_the_weighted_median_follows_the_weight() -> None:
     values = np.array([1.0, 2.0, 30.0])

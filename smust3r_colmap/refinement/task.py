@@ -260,9 +260,7 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
         why_not = moved.reason
         bench.filter(MAX_ERROR_PX)
     free = not why_not
-    principal_point = (
-        f"{STAYED}: {why_not}" if why_not else "free: two halves of the points agree on it and fit better"
-    )
+    principal_point = f"{STAYED}: {why_not}" if why_not else "free: two halves of the points agree on it and fit better"
     for _ in range(MAX_LAST_ROUNDS):
         bench.complete(tight)
         bench.drop_needless_pairs()

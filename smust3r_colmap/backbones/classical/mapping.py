@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +48,9 @@ MIN_PIECE_IMAGES = 4
 """Smaller models are too weak to be a node; only of a smaller segment they are all one can have."""
 MIN_PAIR_INLIERS = 15
 """Verified matches below which COLMAP does not use a pair."""
+MIN_LINKS = 3
+"""Pairs that have to match across two models before another mapper is tried on them: where one image sees one of the
+other side, no mapper has the third view that carries the scale across, and three of them need 10 s to find that out."""
 NEAR_OFFSET = 4
 """Reach of the pairs that are left when the longer ones folded the model."""
 ANGLE_TOLERANCE = 0.3
@@ -219,12 +222,23 @@ class _Ladder:
             self.candidates.append(tuple(accepted))
 
     def _enough(self) -> bool:
-        """Some attempt placed nearly all images, in models that hang together."""
+        """Some attempt placed nearly all images, in models that hang together as far as the matches let them."""
         return any(
             len(placed_images(models)) >= ENOUGH_REGISTERED * len(self.task.images)
-            and len(connected_groups(models)) == 1
+            and not any(self._is_linked(a, b) for a, b in combinations(connected_groups(models), 2))
             for models in self.candidates
         )
+
+    def _is_linked(self, first: Iterable[MappedModel], second: Iterable[MappedModel]) -> bool:
+        """Enough pairs match across two groups for a mapper to join them."""
+        only_first = placed_images(first) - placed_images(second)
+        only_second = placed_images(second) - placed_images(first)
+        links = sum(
+            (a in only_first and b in only_second) or (a in only_second and b in only_first)
+            for (a, b), count in self.inliers.items()
+            if count >= MIN_PAIR_INLIERS
+        )
+        return links >= MIN_LINKS
 
     def _from_chosen_pair(self, database: str, pairs: Sequence[Pair]) -> dict[int, pycolmap.Reconstruction]:
         """One model from the best pair that gives one; nothing where none does."""
