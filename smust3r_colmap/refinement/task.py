@@ -83,7 +83,7 @@ MAP_KEYPOINTS = 1000
 MAX_LAST_ROUNDS, STILL_PERCENT = 4, 0.2
 """Filter and adjust again until no camera moves by more than this part of the path's extent: an image that wrong
 matches hold lets go of them one by one."""
-LARGE = 250
+LARGE = 400
 """Images beyond which parts are adjusted before the whole, and cameras on a part of the points first."""
 STAYED = "kept where it was"
 MODEL_FOLDER, DATABASE_FILE = "model", "database.db"
