@@ -14,6 +14,7 @@ from tracked_scenes import (
     disturbed_around_the_truth,
     fitted,
     make_world,
+    model_with_true_tracks,
     poses_of,
     rms,
 )
@@ -38,19 +39,7 @@ def world() -> World:
 def model(world: World) -> pycolmap.Reconstruction:
     """Disturbed cameras, points near where they belong, true tracks."""
     rng = np.random.default_rng(2)
-    disturbed = pycolmap.Reconstruction()
-    disturbed.add_camera_with_trivial_rig(CAMERA.colmap_camera())
-    for i, (keypoints, pose) in enumerate(zip(world.keypoints, disturbed_around_the_truth(world, rng), strict=True)):
-        image = pycolmap.Image(name=f"{i:04d}.png", keypoints=keypoints.astype(np.float64), camera_id=1, image_id=i + 1)
-        disturbed.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
-    tracks: dict[int, pycolmap.Track] = {}
-    for i, of in enumerate(world.point_of):
-        for row in np.flatnonzero(of >= 0).tolist():
-            tracks.setdefault(int(of[row]), pycolmap.Track()).add_element(i + 1, row)
-    for point, track in sorted(tracks.items()):
-        if track.length() > 1:
-            disturbed.add_point3D(world.points[point] + rng.normal(scale=0.02, size=3), track)
-    return disturbed
+    return model_with_true_tracks(world, disturbed_around_the_truth(world, rng), rng, noise=0.02)
 
 
 @pytest.fixture

@@ -24,6 +24,7 @@ from tracked_scenes import (
     fitted,
     make_collection,
     make_world,
+    model_with_true_tracks,
     pairs_within,
     poses_of,
     rig_from_world,
@@ -111,18 +112,8 @@ class Asked:
 def adjusted(world: World, rng: np.random.Generator, *, distortion: float = CAMERA.params[3]) -> Asked:
     """From stitched poses, true tracks, and the principal point in the middle."""
     stitched = disturbed(world.cam_from_world, rng, position=0.005 * world.extent, rotation_deg=0.3)
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(off_centre(np.zeros(2), distortion=distortion).colmap_camera())
-    for i, keypoints in enumerate(world.keypoints):
-        image = pycolmap.Image(name=f"{i:04d}.png", keypoints=keypoints.astype(np.float64), camera_id=1, image_id=i + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(stitched[i]))
-    tracks: dict[int, pycolmap.Track] = {}
-    for i, of in enumerate(world.point_of):
-        for row in np.flatnonzero(of >= 0).tolist():
-            tracks.setdefault(int(of[row]), pycolmap.Track()).add_element(i + 1, row)
-    for point, track in sorted(tracks.items()):
-        if track.length() > 1:
-            model.add_point3D(world.points[point] + rng.normal(scale=1e-3, size=3), track)
+    camera = off_centre(np.zeros(2), distortion=distortion)
+    model = model_with_true_tracks(world, stitched, rng, camera=camera, noise=1e-3)
     priors = priors_of(model)
     assert adjust(model, priors, calibrated=False, max_iterations=30, threads=1)
     return Asked(world=world, priors=priors, model=model)

@@ -218,6 +218,25 @@ def disturbed_around_the_truth(world: World, rng: np.random.Generator) -> FloatA
     return invert_rigid(off)
 
 
+def model_with_true_tracks(
+    world: World, cam_from_world: FloatArray, rng: np.random.Generator, *, camera: Intrinsics = CAMERA, noise: float
+) -> pycolmap.Reconstruction:
+    """The images at (N, 3, 4) poses and every point that two of them see, off by ``noise`` in each axis."""
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera.colmap_camera())
+    for i, (keypoints, pose) in enumerate(zip(world.keypoints, cam_from_world, strict=True)):
+        image = pycolmap.Image(name=f"{i:04d}.png", keypoints=keypoints.astype(np.float64), camera_id=1, image_id=i + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+    tracks: dict[int, pycolmap.Track] = {}
+    for i, of in enumerate(world.point_of):
+        for row in np.flatnonzero(of >= 0).tolist():
+            tracks.setdefault(int(of[row]), pycolmap.Track()).add_element(i + 1, row)
+    for point, track in sorted(tracks.items()):
+        if track.length() > 1:
+            model.add_point3D(world.points[point] + rng.normal(scale=noise, size=3), track)
+    return model
+
+
 def similarity(points_a: FloatArray, points_b: FloatArray) -> pycolmap.Sim3d:
     """``b_from_a`` that fits best."""
     fit = pycolmap.estimate_sim3d(points_a, points_b)

@@ -13,10 +13,9 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from smust3r_colmap.backbones.classical.features import Pair
 from smust3r_colmap.backbones.classical.mapped_model import MappedModel
 from smust3r_colmap.geometry.sim3 import invert_rigid
-
-Pair = tuple[int, int]
 
 MAX_TURN_DEG = 60.0
 """Neighbouring images that match cannot have turned by more (honest walks: 52 at most; folds: 150)."""

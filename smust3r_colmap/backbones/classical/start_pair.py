@@ -18,10 +18,10 @@ import numpy.typing as npt
 import pycolmap
 from scipy.spatial.transform import Rotation
 
+from smust3r_colmap.backbones.classical.features import Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 
 FloatArray = npt.NDArray[np.float64]
-Pair = tuple[int, int]
 
 MIN_INLIERS = 50
 """Verified matches of a pair to start from; COLMAP's own 100, halved once as it does where none has them."""

@@ -13,7 +13,8 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-Pair = tuple[int, int]
+from smust3r_colmap.backbones.classical.features import Pair
+
 Matches = npt.NDArray[np.uint32]
 
 ENOUGH_FEATURES = 600
