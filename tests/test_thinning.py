@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from smust3r_colmap.backbones.classical.features import Pair
 from smust3r_colmap.backbones.classical.thinning import (
     ENOUGH_FEATURES,
     ENOUGH_IN_SEGMENT,
     WEAK_PAIR_MATCHES,
     Matches,
-    Pair,
     thin_matches,
 )
 
