@@ -53,6 +53,9 @@ from smust3r_colmap.errors import RunDirectoryError, RunLockedError, StorageErro
 FORMAT_VERSION = 1
 """Part of every key; a change of what a stage stores or computes raises it."""
 
+_LOCK_WAIT_S = 3.0
+"""A killed run's lock lives on for a moment in a child that it was just starting, and so do its children."""
+
 _STAGE_FILE = "stage.json"
 
 
@@ -64,7 +67,7 @@ class RunDirectory:
         fresh: throw away what an earlier run left in ``work`` and the results.
 
     Raises:
-        RunLockedError: another living process holds it.
+        RunLockedError: another living process holds it, and goes on holding it for some seconds.
         RunDirectoryError: the path is a file, or a folder with other things in it.
         StorageError: the disk refused.
     """
@@ -94,7 +97,7 @@ class RunDirectory:
                 raise RunDirectoryError(f"{root}: is not empty and was not made by this program; name another folder")
             self.work.mkdir(parents=True, exist_ok=True)
             try:
-                self._lock.acquire(timeout=0)
+                self._lock.acquire(timeout=_LOCK_WAIT_S)
             except Timeout:
                 raise RunLockedError(f"{root}: another process is writing here; wait for it or stop it") from None
             if fresh:

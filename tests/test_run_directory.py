@@ -84,6 +84,25 @@ RunDirectory(Path({str(root)!r}))
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
 
 
+def test_a_lock_that_a_killed_run_leaves_for_a_moment_is_waited_for(tmp_path: Path) -> None:
+    """As when kill -9 meets a run between fork and exec of a child, which holds the lock until its exec."""
+    root = tmp_path / "out"
+    code = f"""
+import time
+from pathlib import Path
+from smust3r_colmap.run_directory import RunDirectory
+with RunDirectory(Path({str(root)!r})):
+    print("held", flush=True)
+    time.sleep(0.5)
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as first:
+        assert first.stdout is not None
+        assert first.stdout.readline() == "held\n"
+        with RunDirectory(root):
+            pass
+    assert first.returncode == 0
+
+
 def test_the_same_process_is_refused_too(tmp_path: Path) -> None:
     with RunDirectory(tmp_path / "out"), pytest.raises(RunLockedError, match="another process is writing"):
         RunDirectory(tmp_path / "out")
