@@ -216,7 +216,7 @@ def synthetic(tmp_path_factory: pytest.TempPathFactory) -> tuple[MappingTask, py
         camera_indices=(0,) * NUM_IMAGES,
         pairs=plan_pairs(Segment(index=0, images=images), neighbours=8, exhaustive_below=25),
         cameras=(start,),
-        trusted_focal={},
+        trusted={},
         seed=0,
     )
     return task, truth

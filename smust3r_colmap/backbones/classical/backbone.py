@@ -13,7 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from smust3r_colmap.backbones.base import BackboneContext, BackboneResult
-from smust3r_colmap.backbones.classical.calibration import CalibrationTask, agree_on_cameras, calibrate_segment
+from smust3r_colmap.backbones.classical.calibration import (
+    CalibrationTask,
+    agree_on_cameras,
+    calibrate_segment,
+    choose_pilots,
+)
 from smust3r_colmap.backbones.classical.dense import DepthTask, make_depth
 from smust3r_colmap.backbones.classical.features import (
     Pair,
@@ -34,6 +39,7 @@ from smust3r_colmap.products import (
     ImageCollection,
     RunFeatures,
     Segment,
+    SegmentKind,
     SegmentPiece,
     SegmentReconstruction,
     UnregisteredImage,
@@ -135,16 +141,42 @@ class ClassicalBackbone:
 
     # --------------------------------------------------------------- every segment
     def _map(self, segments: Sequence[Segment], pairs: Mapping[int, tuple[Pair, ...]]) -> list[MappedSegment]:
-        """Map every segment freely, agree on the cameras, bring every segment to them.
+        """Map pilots freely, agree on the cameras, map the other segments with these, bring the pilots to them.
 
         Windows alone have a say about the cameras, so a loop that is found later changes no window.
         """
-        tasks = [self._mapping_task(segment, pairs[segment.index]) for segment in segments]
-        fixed = ("calibrated",) if self.collection.calibrated else ()
-        inputs = (self._features.key, self.seed, *fixed)
-        keys = [key_of("mapping", METHOD_VERSION, *inputs, task.images, task.pairs) for task in tasks]
-        folders = [self._segment_stage(task.segment, "mapping", key) for task, key in zip(tasks, keys, strict=True)]
-        with self.reporter.stage("mapping", total=len(tasks)) as stage:
+        tasks = {segment.index: self._mapping_task(segment, pairs[segment.index]) for segment in segments}
+        windows = [tasks[segment.index] for segment in segments if segment.kind == "window"]
+        first = tasks if self.collection.calibrated else {task.segment: task for task in choose_pilots(windows)}
+        mapped = self._map_all("mapping", list(first.values()))
+        known = self._agreed_cameras(segments, mapped)
+        for segment in segments:
+            if segment.index not in first:
+                tasks[segment.index] = replace(tasks[segment.index], trusted=known[segment.kind])
+        rest = [task for task in tasks.values() if task.segment not in first]
+        if rest:
+            mapped |= self._map_all("mapping with the cameras found", rest)
+        free = {index: one for index, one in mapped.items() if one.models and not tasks[index].calibrated}
+        agreed = self._agreed_cameras(segments, free)
+        for camera, intrinsics in (agreed["window"] | known["window"]).items():
+            self.reporter.note(
+                f"camera {camera + 1}: the segments agree on a focal length of {intrinsics.focal_px:.1f} px"
+            )
+        kind_of = {segment.index: segment.kind for segment in segments}
+        mapped |= self._calibrate_all(
+            [
+                CalibrationTask(
+                    mapping=tasks[index], mapped=one, agreed={**agreed[kind_of[index]], **tasks[index].trusted}
+                )
+                for index, one in free.items()
+            ]
+        )
+        return [mapped[segment.index] for segment in segments]
+
+    def _map_all(self, name: str, tasks: Sequence[MappingTask]) -> dict[int, MappedSegment]:
+        """What the mappers make of segments, by segment; where they bring the process down, without the global one."""
+        folders = [self._segment_stage(task.segment, "mapping", self._mapping_key(task)) for task in tasks]
+        with self.reporter.stage(name, total=len(tasks)) as stage:
             mapped = self._finish(map_segment, tasks, folders, [_nothing(task) for task in tasks], stage)
         crashed = [k for k, one in enumerate(mapped) if not one.models and not folders[k].is_done]
         if crashed:
@@ -155,35 +187,36 @@ class ClassicalBackbone:
                 )
             for k, one in zip(crashed, again, strict=True):
                 mapped[k] = one
-        cameras = self._agreed_cameras(segments, mapped)
-        chosen = [k for k, one in enumerate(mapped) if one.models]
-        keys = [key_of("calibrated", keys[k], sorted(cameras[k].items())) for k in chosen]
+        return {one.segment: one for one in mapped}
+
+    def _calibrate_all(self, tasks: Sequence[CalibrationTask]) -> dict[int, MappedSegment]:
+        """Freely mapped segments brought to the agreed cameras, by segment."""
+        keys = [key_of("calibrated", self._mapping_key(task.mapping), sorted(task.agreed.items())) for task in tasks]
         folders = [
-            self._segment_stage(mapped[k].segment, "calibrated", key) for k, key in zip(chosen, keys, strict=True)
+            self._segment_stage(task.mapping.segment, "calibrated", key) for task, key in zip(tasks, keys, strict=True)
         ]
-        calibrations = [CalibrationTask(mapping=tasks[k], mapped=mapped[k], agreed=cameras[k]) for k in chosen]
-        with self.reporter.stage("calibration", total=len(chosen)) as stage:
-            calibrated = self._finish(calibrate_segment, calibrations, folders, [mapped[k] for k in chosen], stage)
-        for k, one in zip(chosen, calibrated, strict=True):
-            mapped[k] = one
-        return mapped
+        with self.reporter.stage("calibration", total=len(tasks)) as stage:
+            calibrated = self._finish(calibrate_segment, tasks, folders, [task.mapped for task in tasks], stage)
+        return {one.segment: one for one in calibrated}
+
+    def _mapping_key(self, task: MappingTask) -> str:
+        inputs = (self._features.key, self.seed, task.images, task.pairs, sorted(task.trusted.items()))
+        return key_of("mapping", METHOD_VERSION, *inputs)
 
     def _agreed_cameras(
-        self, segments: Sequence[Segment], mapped: Sequence[MappedSegment]
-    ) -> list[dict[int, Intrinsics]]:
-        """The cameras that each segment is to be brought to: known ones, else those that the windows agree on."""
-        if self.collection.calibrated:
-            return [dict(enumerate(self.collection.cameras))] * len(segments)
-        windows = [one for one, segment in zip(mapped, segments, strict=True) if segment.kind == "window"]
+        self, segments: Sequence[Segment], free: Mapping[int, MappedSegment]
+    ) -> dict[SegmentKind, dict[int, Intrinsics]]:
+        """The cameras that freely mapped windows agree on, by the kind of segment that may take them over.
+
+        What one window alone has seen is agreed as far as that window goes, not for the loops that meet it.
+        """
+        windows = [free[segment.index] for segment in segments if segment.kind == "window" and segment.index in free]
         camera_of_image = [image.camera for image in self.collection.images]
-        agreed = agree_on_cameras(windows, camera_of_image, self.collection.cameras)
-        # What one window alone has seen is agreed as far as that window goes, not for the loops that meet it.
-        agreed_for_loops = agree_on_cameras(windows, camera_of_image, self.collection.cameras, min_models=1)
-        for camera, intrinsics in agreed.items():
-            self.reporter.note(
-                f"camera {camera + 1}: the segments agree on a focal length of {intrinsics.focal_px:.1f} px"
-            )
-        return [agreed_for_loops if segment.kind == "loop" else agreed for segment in segments]
+        least: dict[SegmentKind, int] = {"window": 2, "loop": 1}
+        return {
+            kind: agree_on_cameras(windows, camera_of_image, self.collection.cameras, min_models=count)
+            for kind, count in least.items()
+        }
 
     def _mapping_task(self, segment: Segment, pairs: tuple[Pair, ...]) -> MappingTask:
         return MappingTask(
@@ -193,9 +226,8 @@ class ClassicalBackbone:
             camera_indices=tuple(self.collection.images[i].camera for i in segment.images),
             pairs=pairs,
             cameras=self.collection.cameras,
-            trusted_focal={},
+            trusted=dict(enumerate(self.collection.cameras)) if self.collection.calibrated else {},
             seed=self.seed,
-            calibrated=self.collection.calibrated,
         )
 
     def _finish(

@@ -2,14 +2,16 @@
 
 Self-calibration inside a short segment is weak: focal lengths of neighbouring segments differ by
 some percent, and now and then one diverges (853 px for 525). Segments whose cameras differ do not
-fit together by any similarity. So the run agrees on one set of intrinsics per camera, and every
-model is adjusted to it. A model that had diverged is mapped again under the agreed values.
+fit together by any similarity. So the run agrees on one set of intrinsics per camera: a few windows,
+the pilots, are mapped freely, and every other segment with the median of what they found. Then the
+pilots' models are adjusted to it; one that had diverged is mapped again under the agreed values.
 The next module to read is ``dense``.
 """
 
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -29,6 +31,12 @@ logger = logging.getLogger(__name__)
 
 MAX_ERROR_GROWTH = 1.25
 """A model that fits the agreed cameras worse than this keeps its own."""
+PILOTS = 3
+"""Windows, at least, that a camera's parameters are found in: one may be wrong."""
+PILOT_IMAGES = 150
+"""Images of a camera in them: three windows of the usual length, more where windows are short and each knows less."""
+MIN_PILOT_SHARE = 1 / 3
+"""Share of a window's images that have to be of a camera if the window is to tell of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +51,29 @@ class CalibrationTask:
     mapping: MappingTask
     mapped: MappedSegment
     agreed: Mapping[int, Intrinsics]
+
+
+def choose_pilots(windows: Sequence[MappingTask]) -> list[MappingTask]:
+    """The windows to map with free cameras, before the others take over what these agree on.
+
+    A mapper that knows the camera needs half of the time, for most of its steps go along the valley in
+    which focal length and distortion make up for each other, and it does not diverge. Windows that
+    share no images come first; they are the first of the collection, so that images appended to it
+    change nothing. Windows of a camera that too few others show are all pilots.
+    """
+    num_windows: Counter[int] = Counter()
+    num_images: Counter[int] = Counter()
+    pilots = []
+    for task in [*windows[::2], *windows[1::2]]:
+        seen = Counter(task.camera_indices)
+        if all(num_windows[camera] >= PILOTS and num_images[camera] >= PILOT_IMAGES for camera in seen):
+            continue
+        pilots.append(task)
+        for camera, count in seen.items():
+            if count >= MIN_PILOT_SHARE * len(task.images):
+                num_windows[camera] += 1
+                num_images[camera] += count
+    return pilots
 
 
 def agree_on_cameras(
@@ -90,11 +121,7 @@ def calibrate_segment(task: CalibrationTask) -> MappedSegment:
     if len(placed) >= ENOUGH_REGISTERED * len(task.mapping.images):
         mapped = replace(mapped, models=tuple(sound), unregistered=left_over(task.mapping, sound, mapped.unregistered))
     elif len(sound) < len(mapped.models):
-        # Without a prior COLMAP estimates the focal length with the first pose, whatever else is held.
-        agreed = {index: replace(camera, has_prior_focal=True) for index, camera in task.agreed.items()}
-        start = tuple(agreed.get(index, camera) for index, camera in enumerate(task.mapping.cameras))
-        all_agreed = trusted.keys() >= set(task.mapping.camera_indices)  # then nothing can diverge again
-        again = map_segment(replace(task.mapping, cameras=start, trusted_focal=trusted, calibrated=all_agreed))
+        again = map_segment(replace(task.mapping, trusted=task.agreed))
         attempts = (*mapped.attempts, "focal length off the run's: mapped again", *again.attempts)
         if len(placed_images(again.models)) < len(placed):
             left = left_over(task.mapping, sound, again.unregistered)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from pathlib import Path
 
@@ -55,7 +55,7 @@ NEAR_OFFSET = 4
 """Reach of the pairs that are left when the longer ones folded the model."""
 ANGLE_TOLERANCE = 0.3
 """Share of the chosen pair's angle that the mapper, which estimates it again by sampling, has to find."""
-METHOD_VERSION = 2
+METHOD_VERSION = 3
 """To be raised when mapping or calibration change, so that finished segments are mapped again."""
 MAX_MODELS = 6
 """Models that one attempt may start; what is left of a segment after so many is crumbs that cost minutes."""
@@ -69,10 +69,10 @@ class MappingTask:
         segment: its index. database: the run's. images: indices in order, with their cameras.
         pairs: which of the database's pairs may be used; all of them have been matched.
         cameras: start values by camera index.
-        trusted_focal: the run's consensus focal length by camera index, empty in the first pass.
+        trusted: cameras that are known, by camera index; empty for a pilot. They stay as they are where all of
+            the segment's are known.
         seed: of pycolmap's samplers.
         use_global: the last rung may be climbed; not after it brought the process down.
-        calibrated: the cameras are known and stay as they are.
     """
 
     segment: int
@@ -81,10 +81,23 @@ class MappingTask:
     camera_indices: tuple[int, ...]
     pairs: tuple[Pair, ...]
     cameras: tuple[Intrinsics, ...]
-    trusted_focal: Mapping[int, float]
+    trusted: Mapping[int, Intrinsics]
     seed: int
     use_global: bool = True
-    calibrated: bool = False
+
+    @property
+    def calibrated(self) -> bool:
+        """All cameras of the segment are known."""
+        return self.trusted.keys() >= set(self.camera_indices)
+
+    @property
+    def start_cameras(self) -> tuple[Intrinsics, ...]:
+        """What to start from, by camera index.
+
+        Without a prior COLMAP estimates the focal length with the first pose, whatever else is held.
+        """
+        known = {index: replace(camera, has_prior_focal=True) for index, camera in self.trusted.items()}
+        return tuple(known.get(index, camera) for index, camera in enumerate(self.cameras))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,7 +256,8 @@ class _Ladder:
     def _from_chosen_pair(self, database: str, pairs: Sequence[Pair]) -> dict[int, pycolmap.Reconstruction]:
         """One model from the best pair that gives one; nothing where none does."""
         camera_of = dict(zip(self.task.images, self.task.camera_indices, strict=True))
-        cameras = {image: self.task.cameras[index] for image, index in camera_of.items()}
+        start_cameras = self.task.start_cameras
+        cameras = {image: start_cameras[index] for image, index in camera_of.items()}
         with open_database(self.scratch / database) as opened:
             starts = choose_start_pairs(opened, pairs, cameras, seed=self.task.seed)
         for number, start in enumerate(starts):
@@ -325,7 +339,8 @@ class _Ladder:
         if not np.isfinite(model.reprojection_error_px) or model.reprojection_error_px > 3.0:
             return f"mean reprojection error {model.reprojection_error_px:.2f} px"
         camera_of = dict(zip(self.task.images, self.task.camera_indices, strict=True))
-        return absurd_focal(model) or diverged_focal(model, camera_of, self.task.trusted_focal)
+        trusted = {camera: intrinsics.focal_px for camera, intrinsics in self.task.trusted.items()}
+        return absurd_focal(model) or diverged_focal(model, camera_of, trusted)
 
     def _count_jumps(self, models: Sequence[MappedModel]) -> int:
         with open_database(self.task.database) as database:
@@ -352,7 +367,7 @@ class _Ladder:
             pycolmap.Database.open(path) as own,
             pycolmap.DatabaseTransaction(own),
         ):
-            write_images(own, self.task.cameras, zip(self.task.images, self.task.camera_indices, strict=True))
+            write_images(own, self.task.start_cameras, zip(self.task.images, self.task.camera_indices, strict=True))
             num_features = {}
             for image in self.task.images:
                 if run.exists_keypoints(image + 1):
@@ -371,7 +386,14 @@ class _Ladder:
 
     def _convert(self, models: dict[int, pycolmap.Reconstruction], method: str) -> list[MappedModel]:
         converted = [model_from_reconstruction(model, method) for model in models.values()]
-        return [model for model in converted if len(model.images) >= self.min_images]
+        return [self._with_own_priors(model) for model in converted if len(model.images) >= self.min_images]
+
+    def _with_own_priors(self, model: MappedModel) -> MappedModel:
+        """The model whose cameras call a focal length prior knowledge only where the images' own cameras do."""
+        camera_of = dict(zip(self.task.images, self.task.camera_indices, strict=True))
+        priors = [self.task.cameras[camera_of[image]].has_prior_focal for image in model.images]
+        intrinsics = [replace(one, has_prior_focal=prior) for one, prior in zip(model.intrinsics, priors, strict=True)]
+        return replace(model, intrinsics=tuple(intrinsics))
 
 
 def _from_pair(options: pycolmap.IncrementalPipelineOptions, pair: StartPair) -> pycolmap.IncrementalPipelineOptions:
