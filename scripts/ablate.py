@@ -4,6 +4,7 @@
     python scripts/ablate.py castle_p30 --backbone classical --segment-length 12 --lengths 8 12 16 20
 
     lengths      (a) images per segment, with an overlap of half of them
+    overlaps         images that neighbouring segments share, which the paper does not ask
     groups       (b) transform group between segments
     loops        (c) loop closing off and on, and with places that only look alike
     edges        (d) edges from points, from camera poses, or both
@@ -65,9 +66,11 @@ from smust3r_colmap.stitching import Stitching, stitch
 
 DriftOf = Literal["image", "segment"]
 
-QUESTIONS = ("lengths", "groups", "loops", "edges", "weighting")
+QUESTIONS = ("lengths", "overlaps", "groups", "loops", "edges", "weighting")
 LENGTHS = (20, 40, 60, 80, 100, 200)
 """The paper's."""
+OVERLAPS = (1 / 6, 1 / 4, 1 / 3, 1 / 2, 2 / 3)
+"""Of the length of a segment."""
 FALSE_SHARE = 0.3
 """Of all loops that are tried, where false ones are injected."""
 
@@ -103,6 +106,7 @@ def questions(
             for length in lengths
             if length <= num_images
         ),
+        *(_with_overlap(base, round(share * base.segmentation.segment_length)) for share in OVERLAPS),
         *(
             _changed("groups", base, transform_group=group)
             for group in get_args(TransformGroup)
@@ -117,6 +121,12 @@ def questions(
 def with_length(base: RunConfig, length: int) -> RunConfig:
     """The same with another segment length; half of each segment is shared with the next."""
     return replace(base, segmentation=replace(base.segmentation, segment_length=length, overlap=length // 2))
+
+
+def _with_overlap(base: RunConfig, overlap: int) -> Configuration:
+    config = replace(base, segmentation=replace(base.segmentation, overlap=overlap))
+    label = f"l = {base.segmentation.segment_length}, p = {overlap}"
+    return Configuration(question="overlaps", label=label, config=config)
 
 
 def _loop_configurations(base: RunConfig, *, oracle: bool) -> Iterator[Configuration]:

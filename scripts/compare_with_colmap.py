@@ -50,6 +50,7 @@ from comparison_figures import (
 from comparison_report import as_json, render_markdown, render_stages, render_table
 from plot_trajectory import read_tum_by_name
 
+from smust3r_colmap.config import SegmentationConfig
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.evaluation import (
     Evaluation,
@@ -102,7 +103,7 @@ def parse_arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("datasets", nargs="+", metavar="DATASET", help="a folder, or its name in $SMUST3R_DATA")
     parser.add_argument("--output", type=Path, default=Path("comparison_out"), help="working folder (%(default)s)")
     parser.add_argument("--segment-length", type=int, help="default: 12 for the short sets, otherwise 60")
-    parser.add_argument("--overlap", type=int, help="default: half of the segment length")
+    parser.add_argument("--overlap", type=int, help="default: half of the segment length, at most 20")
     parser.add_argument("--all-images", action="store_true", help=f"use all images where there is a {SUBSET_FILE}")
     parser.add_argument(
         "--cameras",
@@ -200,7 +201,7 @@ def run_methods(dataset: Dataset, arguments: argparse.Namespace) -> Iterator[Res
 def run_ours(dataset: Dataset, work: Path, arguments: argparse.Namespace, *, workers: int) -> Result:
     """``smust3r-colmap reconstruct`` from scratch, or what an earlier comparison left with --reuse."""
     length = arguments.segment_length or (12 if dataset.name in SHORT_SEGMENTS else 60)
-    overlap = arguments.overlap or length // 2
+    overlap = arguments.overlap or min(SegmentationConfig().overlap, length // 2)
     settings = ["--segment-length", str(length), "--overlap", str(overlap), *arguments.flags]
     label = " ".join([f"{arguments.ours_name} l={length} p={overlap}", *arguments.flags])
     folder = arguments.ours_name

@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.errors import DegenerateAlignmentError, InputError
 from smust3r_colmap.geometry.sim3 import Sim3
+from smust3r_colmap.geometry.so3 import nearest_rotation
 
 FloatArray = npt.NDArray[np.float64]
 Trajectory = Mapping[str, FloatArray]
@@ -155,8 +156,7 @@ def _align(estimated: FloatArray, reference: FloatArray) -> tuple[Sim3, str]:
     width_est, _ = _spread(centred_est, mean_est, "estimate")
     width_ref, line_ref = _spread(centred_ref, mean_ref, "reference")
 
-    u, _, vt = np.linalg.svd(centred_ref.T @ centred_est)  # eq. 38, transposed roles
-    rotation: FloatArray = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt  # eqs. 39, 40
+    rotation = nearest_rotation(centred_ref.T @ centred_est)  # of eq. 38, transposed roles
     alignment = "centres"
     if min(width_est, width_ref) < _MIN_RELATIVE_WIDTH:
         rotation = _roll_from_orientations(rotation, line_ref, estimated[:, :, :3], reference[:, :, :3])

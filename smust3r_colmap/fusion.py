@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
-from smust3r_colmap.geometry.so3 import angles_between
+from smust3r_colmap.geometry.so3 import angles_between, nearest_rotation
 from smust3r_colmap.products import (
     DenseMaps,
     FloatArray,
@@ -238,9 +238,8 @@ def _agreeing(sighting: _Sightings, usual: dict[tuple[int, int], tuple[float, fl
 def _mean_pose(world_from_cam: FloatArray, weights: FloatArray) -> FloatArray:
     """Weighted mean (3, 4) of rigid poses (K, 3, 4)."""
     mean = np.average(world_from_cam, axis=0, weights=weights)
-    u, _, vt = np.linalg.svd(mean[:, :3])
     # The rotation nearest to the mean matrix minimises the sum of squared chordal distances.
-    mean[:, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    mean[:, :3] = nearest_rotation(mean[:, :3])
     return mean
 
 

@@ -45,6 +45,7 @@ def asked(question: str, *, metric: bool = True, oracle: bool = True) -> dict[st
 def test_every_question_changes_one_setting_and_has_the_default_among_its_answers() -> None:
     own = {
         "lengths": {"segment_length", "overlap"},
+        "overlaps": {"overlap"},
         "groups": {"transform_group"},
         "loops": {"loops", "loop_kernel"},
         "edges": {"alignment_edges"},

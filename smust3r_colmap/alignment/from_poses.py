@@ -26,7 +26,7 @@ from smust3r_colmap.config import RobustKernel
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3
-from smust3r_colmap.geometry.so3 import angles_between, skew
+from smust3r_colmap.geometry.so3 import angles_between, nearest_rotation, skew
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import FloatArray, SegmentPiece, TransformEstimate
 
@@ -320,8 +320,7 @@ def _closed_form(pairs: _Cameras, fit: Sim3, terms: _Terms, *, fixed_scale: bool
     a, b = pairs.centres_a - mean_a, pairs.centres_b - mean_b
     by_centres = float(fit.scale) * (terms.centre_weights[:, None] * b).T @ a / terms.centre_sigma**2
     by_rotations = np.einsum("n,nij,nkj->ik", terms.rotation_weights, pairs.rotations_b, pairs.rotations_a)
-    u, _, vt = np.linalg.svd(by_centres + by_rotations / (2 * terms.rotation_sigma**2))
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    rotation = nearest_rotation(by_centres + by_rotations / (2 * terms.rotation_sigma**2))
     scale = float(fit.scale)
     if not fixed_scale:
         radius_a, radius_b = _radius(a, share**2), _radius(b, share**2)

@@ -21,6 +21,7 @@ from smust3r_colmap.config import RobustKernel
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3
+from smust3r_colmap.geometry.so3 import nearest_rotation
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import TransformEstimate
 
@@ -428,8 +429,7 @@ class _SimilarityRefit:
         a, b = pairs.points_a - mean_a, pairs.points_b - mean_b
         _check_spread(a, share, "first")
         _check_spread(b, share, "second")
-        u, _, vt = np.linalg.svd((share[:, None] * b).T @ a)
-        linear = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        linear = nearest_rotation((share[:, None] * b).T @ a)
         if not self.fixed_scale:
             in_scale = precision * kernel_weights ** (2 if self.squares_in_scale else 1)
             linear *= np.sqrt(in_scale @ (b**2).sum(axis=1)) / np.sqrt(in_scale @ (a**2).sum(axis=1))

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complexfloating[Any, Any]]
@@ -70,15 +69,22 @@ def mean_exp(exponent: npt.ArrayLike) -> ComplexArray:
 
 def rotation_log(rotation: FloatArray) -> FloatArray:
     """Rotation vectors (..., 3) of at most pi; at exactly pi either of the two opposite axes."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (0.6 s that most child processes need not pay)
+
     flat = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
     return np.reshape(flat, rotation.shape[:-1])
 
 
 def nearest_rotation(matrix: FloatArray) -> FloatArray:
-    """Rotations (..., 3, 3) nearest to matrices of positive determinant: their polar factors; NaN stays NaN."""
+    """Rotations (..., 3, 3) nearest to matrices by the sum of squared differences; NaN stays NaN.
+
+    The nearest to ``second.T @ first`` is the rotation that turns the vectors (N, 3) of ``first`` best
+    onto those of ``second`` (Umeyama 1991, eqs. 39 and 40).
+    """
     finite = np.isfinite(matrix).all(axis=(-2, -1))
     out = np.full_like(matrix, np.nan)
     u, _, vt = np.linalg.svd(matrix[finite])
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
     out[finite] = u @ vt
     return out
 

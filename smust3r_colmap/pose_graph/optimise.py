@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.pose_graph.contract import contract
@@ -350,7 +350,7 @@ def _kernel_thresholds(graph: PoseGraph, belief: Belief, confidence: float) -> F
     dof = graph.target_from_source.DOF
     edges = loop_sums(np.ones(len(graph)), graph.loop, graph.num_loops)
     freedom = dof * (edges - _own_nodes(graph))
-    limit: FloatArray = belief.scale * chi2.ppf(confidence, np.maximum(freedom, dof))
+    limit: FloatArray = belief.scale * chdtri(np.maximum(freedom, dof), 1 - confidence)
     return limit
 
 

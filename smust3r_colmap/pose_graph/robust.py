@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.pose_graph.graph import TRUSTED, BoolArray, FloatArray, IntArray, PoseGraph, edge_weights
@@ -112,14 +112,14 @@ def information_scale(evidence: LoopEvidence, tolerance: float) -> float:
             believed when most loops agree on them.
     """
     tested = evidence.freedom > 0
-    ratio = evidence.distance[tested] / chi2.median(evidence.freedom[tested])
+    ratio = evidence.distance[tested] / chdtri(evidence.freedom[tested], 0.5)
     votes = np.concatenate([ratio, np.full(SCALE_VOTES, tolerance**2)])
     return max(float(np.median(votes)), tolerance**-2)
 
 
 def quantiles(evidence: LoopEvidence, confidence: float) -> FloatArray:
     """(L,) squared distance below which a true loop stays with this probability; infinite where untested."""
-    quantile: FloatArray = chi2.ppf(confidence, np.maximum(evidence.freedom, 1))
+    quantile: FloatArray = chdtri(np.maximum(evidence.freedom, 1), 1 - confidence)
     return np.where(evidence.freedom > 0, quantile, np.inf)
 
 

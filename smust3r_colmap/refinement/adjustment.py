@@ -16,6 +16,7 @@ import pycolmap
 from scipy.sparse import csr_array
 
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.geometry.so3 import nearest_rotation
 from smust3r_colmap.products import FloatArray
 
 logger = logging.getLogger(__name__)
@@ -279,8 +280,7 @@ def _turn_back(model: pycolmap.Reconstruction, before: FloatArray) -> None:
     middle, extent = new.mean(axis=0), extent_of(old)
     covariance = (new - middle).T @ (old - old.mean(axis=0)) / extent**2
     covariance += np.einsum("nki,nkj->ij", after[:, :, :3], before[:, :, :3])
-    u, _, vt = np.linalg.svd(covariance)
-    old_from_new = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
+    old_from_new = nearest_rotation(covariance.T)
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(old_from_new), middle - old_from_new @ middle))
 
 

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy.cluster.vq import kmeans2, vq
 
 NUM_CENTRES = 64
 _TRAINING_FEATURES = 50_000
@@ -26,6 +25,8 @@ def vlad_descriptors(sift: Sequence[npt.NDArray[np.uint8]], *, rng: np.random.Ge
         sift: (K_i, 128) uint8 per image, already root-normalised by COLMAP; the first thousand are used.
         rng: chooses the training sample and the first centres.
     """
+    from scipy.cluster.vq import kmeans2, vq  # noqa: PLC0415  (0.5 s that child processes need not pay)
+
     features = [one[:FEATURES_PER_IMAGE] for one in sift]
     stacked = np.concatenate([*features, np.zeros((0, 128), np.uint8)])
     out = np.zeros((len(features), NUM_CENTRES, 128), np.float32)

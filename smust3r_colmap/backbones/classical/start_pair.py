@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import pycolmap
-from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.backbones.classical.features import Pair
 from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.geometry.so3 import nearest_rotation
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -102,8 +102,8 @@ def _parallax_deg(rays_first: FloatArray, rays_second: FloatArray) -> float:
     first, second = (
         rays[finite] / np.linalg.norm(rays[finite], axis=1, keepdims=True) for rays in (rays_first, rays_second)
     )
-    second_from_first, _ = Rotation.align_vectors(second, first)
-    cosines = np.einsum("ij,ij->i", second, second_from_first.apply(first))
+    second_from_first = nearest_rotation(second.T @ first)
+    cosines = np.einsum("ij,ij->i", second, first @ second_from_first.T)
     return float(np.degrees(np.median(np.arccos(np.clip(cosines, -1.0, 1.0)))))
 
 

@@ -32,6 +32,7 @@ from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.geometry.so3 import nearest_rotation
 from smust3r_colmap.importers.camera_prior import PLAUSIBLE_FOCAL_RATIO
 from smust3r_colmap.statistics import weighted_median
 
@@ -134,9 +135,8 @@ def register_camera(
         )
     weights /= weights.sum()
     mean_cam, mean_world = weights @ cam, weights @ world
-    u, _, vt = np.linalg.svd((world - mean_world).T @ (weights[:, None] * (cam - mean_cam)))
     world_from_cam = np.eye(4)
-    world_from_cam[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    world_from_cam[:3, :3] = nearest_rotation((world - mean_world).T @ (weights[:, None] * (cam - mean_cam)))
     world_from_cam[:3, 3] = mean_world - world_from_cam[:3, :3] @ mean_cam
     return world_from_cam
 

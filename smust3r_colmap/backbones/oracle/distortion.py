@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.backbones.oracle.settings import REFERENCE_LENGTH, OracleSettings, WarpGroup
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.geometry.so3 import nearest_rotation
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -147,10 +148,8 @@ def warped_cameras(warp: FloatArray, seg_from_cam: FloatArray, rays_cam: FloatAr
     now_seg = rays_cam @ np.swapaxes(seg_from_rays, 1, 2)  # (N, P, 3)
     now_seg /= np.linalg.norm(now_seg, axis=2, keepdims=True)
     unit_cam = rays_cam / np.linalg.norm(rays_cam, axis=1, keepdims=True)
-    u, _, vt = np.linalg.svd(np.swapaxes(now_seg, 1, 2) @ unit_cam)
-    u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
     out = np.empty_like(seg_from_cam)
-    out[:, :, :3] = u @ vt
+    out[:, :, :3] = nearest_rotation(np.swapaxes(now_seg, 1, 2) @ unit_cam)
     out[:, :, 3] = warped_points(warp, seg_from_cam[:, :, 3])
     return out
 
