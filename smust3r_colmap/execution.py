@@ -65,68 +65,135 @@ def usable_cores() -> int:
         return os.cpu_count() or 1
 
 
-def map_tasks(
-    function: Callable[[TaskT], ResultT], tasks: Sequence[TaskT], *, workers: int, log_file: Path | None = None
-) -> Iterator[TaskResult[ResultT]]:
-    """Results of ``function`` over ``tasks`` as they are ready, in any order, from child processes.
+class TaskPool:
+    """Child processes that stay from one batch of tasks to the next, for starting one takes a second.
+
+    Children start when there is a first task for them, and end with the ``with`` block.
 
     Args:
-        function: importable at module level; it and the tasks travel by pickle between our own processes.
         workers: how many children at most, at least one even for a single task.
         log_file: where the native code of the children writes its messages; None throws them away.
     """
-    waiting = deque(range(len(tasks)))
-    while waiting:
-        suspects = yield from _run_until_broken(function, tasks, waiting, workers, log_file)
-        # One of the tasks in flight killed its process and took the pool along; find out which.
-        for index in suspects:
-            alone = deque([index])
-            died = yield from _run_until_broken(function, tasks, alone, 1, log_file)
-            if died:
-                reason = "the process that worked on it died (out of memory, or an error inside a native library)"
-                yield TaskResult(index=index, value=TaskFailure(reason=reason, crashed=True))
+
+    def __init__(self, *, workers: int, log_file: Path | None = None) -> None:
+        self.workers = max(1, workers)
+        self.log_file = log_file
+        self._executor: ProcessPoolExecutor | None = None
+        self._cpu_s: dict[int, float] = {}
+
+    def __enter__(self) -> TaskPool:
+        _open_pools.append(self)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *exc: object) -> None:
+        if kind is not None:
+            self._kill()
+        self._shut_down()
+        _open_pools.remove(self)
+
+    @property
+    def living_cpu_s(self) -> float:
+        """Processor time of the living children when each of them finished its last task."""
+        return sum(self._cpu_s.values())
+
+    def map(self, function: Callable[[TaskT], ResultT], tasks: Sequence[TaskT]) -> Iterator[TaskResult[ResultT]]:
+        """Results of ``function`` over ``tasks`` as they are ready, in any order.
+
+        Args:
+            function: importable at module level; it and the tasks travel by pickle between our own processes.
+        """
+        waiting = deque(range(len(tasks)))
+        while waiting:
+            suspects = yield from self._run_until_broken(function, tasks, waiting, self.workers)
+            # One of the tasks in flight killed its process and took the pool along; find out which.
+            for index in suspects:
+                died = yield from self._run_until_broken(function, tasks, deque([index]), 1)
+                if died:
+                    reason = "the process that worked on it died (out of memory, or an error inside a native library)"
+                    yield TaskResult(index=index, value=TaskFailure(reason=reason, crashed=True))
+
+    def _run_until_broken(
+        self, function: Callable[[TaskT], ResultT], tasks: Sequence[TaskT], waiting: deque[int], workers: int
+    ) -> Generator[TaskResult[ResultT], None, list[int]]:
+        """Drain ``waiting``; returns the indices in flight when a child died, empty when none did."""
+        in_flight: dict[Future[_Report[ResultT]], int] = {}
+        try:
+            while waiting or in_flight:
+                # Twice the workers keeps them busy and the list of suspects short.
+                while waiting and len(in_flight) < 2 * workers:
+                    index = waiting[0]
+                    in_flight[self._started().submit(_guarded, function, tasks[index])] = index
+                    waiting.popleft()
+                done, _ = wait(in_flight, return_when=FIRST_COMPLETED)
+                for future in done:
+                    report = future.result()
+                    self._cpu_s[report.process] = report.cpu_s
+                    yield TaskResult(index=in_flight.pop(future), value=report.value)
+        except BrokenProcessPool:
+            suspects = sorted(in_flight.values())
+            logger.warning("a child process died; running %d tasks again one by one", len(suspects))
+            self._shut_down()
+            return suspects
+        except BaseException:
+            self._kill()
+            self._shut_down()
+            raise
+        return []
+
+    def _started(self) -> ProcessPoolExecutor:
+        if self._executor is None:
+            self._executor = ProcessPoolExecutor(
+                max_workers=self.workers,
+                mp_context=get_context("spawn"),
+                initializer=_start_child,
+                initargs=(os.getpid(), None if self.log_file is None else str(self.log_file)),
+            )
+        return self._executor
+
+    def _kill(self) -> None:
+        if self._executor is not None:
+            for process in list((self._executor._processes or {}).values()):
+                process.kill()
+
+    def _shut_down(self) -> None:
+        if self._executor is not None:
+            # Waiting lets the system count the children's processor time as ours.
+            self._executor.shutdown(wait=True, cancel_futures=True)
+        self._executor = None
+        self._cpu_s.clear()
 
 
-def _run_until_broken(
-    function: Callable[[TaskT], ResultT],
-    tasks: Sequence[TaskT],
-    waiting: deque[int],
-    workers: int,
-    log_file: Path | None,
-) -> Generator[TaskResult[ResultT], None, list[int]]:
-    """Drain ``waiting``; returns the indices in flight when a child died, empty when none did."""
-    pool = ProcessPoolExecutor(
-        max_workers=max(1, min(workers, len(waiting))),
-        mp_context=get_context("spawn"),
-        initializer=_start_child,
-        initargs=(os.getpid(), None if log_file is None else str(log_file)),
-    )
-    in_flight: dict[Future[ResultT | TaskFailure], int] = {}
-    try:
-        while waiting or in_flight:
-            # Twice the workers keeps them busy and the list of suspects short.
-            while waiting and len(in_flight) < 2 * workers:
-                index = waiting[0]
-                in_flight[pool.submit(_guarded, function, tasks[index])] = index
-                waiting.popleft()
-            done, _ = wait(in_flight, return_when=FIRST_COMPLETED)
-            for future in done:
-                value = future.result()
-                yield TaskResult(index=in_flight.pop(future), value=value)
-    except BrokenProcessPool:
-        suspects = sorted(in_flight.values())
-        logger.warning("a child process died; running %d tasks again one by one", len(suspects))
-        return suspects
-    except BaseException:
-        _kill(pool)
-        raise
-    finally:
-        # Waiting lets the system count the children's processor time as ours.
-        pool.shutdown(wait=True, cancel_futures=True)
-    return []
+_open_pools: list[TaskPool] = []
 
 
-def _guarded(function: Callable[[TaskT], ResultT], task: TaskT) -> ResultT | TaskFailure:
+def living_children_cpu_s() -> float:
+    """Processor time that the system does not count as ours yet, because the children that used it live on."""
+    return sum(pool.living_cpu_s for pool in _open_pools)
+
+
+def map_tasks(
+    function: Callable[[TaskT], ResultT], tasks: Sequence[TaskT], *, workers: int, log_file: Path | None = None
+) -> Iterator[TaskResult[ResultT]]:
+    """One batch of tasks in child processes of its own; see ``TaskPool``."""
+    with TaskPool(workers=min(workers, len(tasks)), log_file=log_file) as pool:
+        yield from pool.map(function, tasks)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Report(Generic[ResultT]):
+    """What a child sends back: the outcome, its process id, and its processor time so far."""
+
+    value: ResultT | TaskFailure
+    process: int
+    cpu_s: float
+
+
+def _guarded(function: Callable[[TaskT], ResultT], task: TaskT) -> _Report[ResultT]:
+    value = _outcome(function, task)
+    return _Report(value=value, process=os.getpid(), cpu_s=time.process_time())
+
+
+def _outcome(function: Callable[[TaskT], ResultT], task: TaskT) -> ResultT | TaskFailure:
     """An error of the task becomes its result; a full disk and mistakes of ours still end the run."""
     import cv2  # noqa: PLC0415  (only children pay for it)
 
@@ -164,8 +231,3 @@ def _start_child(parent_pid: int, log_file: str | None) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-def _kill(pool: ProcessPoolExecutor) -> None:
-    for process in list((pool._processes or {}).values()):
-        process.kill()

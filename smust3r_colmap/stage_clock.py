@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from smust3r_colmap.execution import living_children_cpu_s
 from smust3r_colmap.progress import Reporter, Stage
 from smust3r_colmap.summary import StageSummary
 
@@ -16,7 +17,7 @@ from smust3r_colmap.summary import StageSummary
 class StageClock:
     """A ``Reporter`` that passes everything on and keeps the cost of each stage.
 
-    Processor time is that of this process and of the children that have ended.
+    Processor time is that of this process and of its children.
     """
 
     def __init__(self, reporter: Reporter) -> None:
@@ -72,4 +73,4 @@ def peak_memory_bytes() -> int:
 
 def _cpu_s() -> float:
     times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
+    return times.user + times.system + times.children_user + times.children_system + living_children_cpu_s()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from smust3r_colmap.errors import StorageError
-from smust3r_colmap.execution import TaskFailure, map_tasks
+from smust3r_colmap.execution import TaskFailure, TaskPool, living_children_cpu_s, map_tasks
 
 
 def square_unless_told_otherwise(task: int | str) -> int:
@@ -62,6 +62,48 @@ def test_an_error_inside_opencv_costs_only_its_task() -> None:
 def test_a_full_disk_ends_the_run() -> None:
     with pytest.raises(StorageError, match="disk full"):
         outcomes(["disk"])
+
+
+def process_of(work_s: float) -> int:
+    started = time.process_time()
+    while time.process_time() - started < work_s:
+        pass
+    return os.getpid()
+
+
+def processes(pool: TaskPool, work_s: float = 0.0) -> set[int | TaskFailure]:
+    return {result.value for result in pool.map(process_of, [work_s] * 4)}
+
+
+def test_children_of_a_pool_serve_batch_after_batch_and_their_time_is_counted_at_once() -> None:
+    with TaskPool(workers=1) as pool:
+        assert living_children_cpu_s() == 0
+        first = processes(pool, 0.1)
+        spent = living_children_cpu_s()
+        assert spent > 0.4
+        assert processes(pool) == first
+        assert living_children_cpu_s() > spent
+        ended = os.times()
+    assert living_children_cpu_s() == 0
+    assert os.times().children_user - ended.children_user > 0.3  # the system's account has it now
+
+
+def test_a_pool_goes_on_with_a_new_child_after_one_died() -> None:
+    with TaskPool(workers=1) as pool:
+        (dead,) = processes(pool)
+        (failed,) = (result.value for result in pool.map(square_unless_told_otherwise, ["die"]))
+        assert isinstance(failed, TaskFailure)
+        (living,) = processes(pool)
+        assert living != dead
+
+
+def test_an_error_inside_the_block_ends_the_children_at_once() -> None:
+    started = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), TaskPool(workers=2) as pool:
+        results = pool.map(time.sleep, [0.0, 60.0, 60.0])
+        next(results)
+        raise KeyboardInterrupt
+    assert time.monotonic() - started < 30
 
 
 def test_native_messages_go_to_the_log(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from smust3r_colmap.backbones.classical.calibration import (
     CalibrationTask,
     agree_on_cameras,
     calibrate_segment,
+    choose_pilots,
 )
 from smust3r_colmap.backbones.classical.descriptors import vlad_descriptors
 from smust3r_colmap.backbones.classical.features import (
@@ -49,7 +50,7 @@ from smust3r_colmap.backbones.classical.start_pair import StartPair
 from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
 from smust3r_colmap.config import ClassicalConfig
 from smust3r_colmap.errors import StorageError
-from smust3r_colmap.execution import TaskFailure, TaskResult, map_tasks
+from smust3r_colmap.execution import TaskFailure, TaskPool, TaskResult, map_tasks
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.products import ImageCollection, RunFeatures, Segment, SourceImage, Tracks
@@ -240,6 +241,48 @@ def test_a_segment_is_mapped_to_rounding_without_noise(
     assert not mapped.unregistered
     assert centre_error(model, truth) < 1e-3
     assert model.intrinsics[0].params == pytest.approx((1280.0, 512.0, 384.0, 0.05), rel=1e-3, abs=1e-3)
+
+
+def test_known_cameras_stay_as_they_are_and_become_no_prior(
+    synthetic: tuple[MappingTask, pycolmap.Reconstruction],
+) -> None:
+    task, truth = synthetic
+    known = replace(task.cameras[0], params=(1280.0, 512.0, 384.0, 0.05))
+    (model,) = map_segment(replace(task, trusted={0: known})).models
+    assert set(model.intrinsics) == {known}
+    assert centre_error(model, truth) < 1e-4
+
+
+def windows_of(cameras: Sequence[Sequence[int]], task: MappingTask) -> list[MappingTask]:
+    """Windows whose images have these cameras."""
+    return [
+        replace(task, segment=k, camera_indices=tuple(own), images=tuple(range(len(own))))
+        for k, own in enumerate(cameras)
+    ]
+
+
+def pilots_of(cameras: Sequence[Sequence[int]], task: MappingTask) -> list[int]:
+    return [pilot.segment for pilot in choose_pilots(windows_of(cameras, task))]
+
+
+def test_pilots_are_the_first_windows_that_share_no_images(
+    synthetic: tuple[MappingTask, pycolmap.Reconstruction],
+) -> None:
+    task = synthetic[0]
+    assert pilots_of([[0] * 60] * 9, task) == [0, 2, 4]
+    assert pilots_of([[0] * 60] * 30, task) == [0, 2, 4]
+    assert pilots_of([[0] * 20] * 40, task) == [0, 2, 4, 6, 8, 10, 12, 14]  # 150 images
+    assert pilots_of([[0] * 60] * 4, task) == [0, 2, 1]
+    assert pilots_of([[0] * 60], task) == [0]
+
+
+def test_every_camera_has_pilots_of_its_own(synthetic: tuple[MappingTask, pycolmap.Reconstruction]) -> None:
+    task = synthetic[0]
+    two = [[0] * 60] * 8 + [[1] * 60] * 8
+    assert sorted(pilots_of(two, task)) == [0, 2, 4, 8, 10, 12]
+    # A camera of one window only, and one that is rare in all of them, leave their windows free.
+    assert sorted(pilots_of([[0] * 60] * 8 + [[1] * 60] + [[0] * 60], task)) == [0, 2, 4, 8]
+    assert len(pilots_of([[0] * 55 + [1] * 5] * 9, task)) == 9
 
 
 def test_mapping_twice_gives_the_same_bits(synthetic: tuple[MappingTask, pycolmap.Reconstruction]) -> None:
@@ -477,11 +520,15 @@ def test_a_segment_that_failed_is_tried_again_at_the_next_start(
     synthetic: tuple[MappingTask, pycolmap.Reconstruction], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kept = read_only_segment(0, model_of_walk(6))
-    monkeypatch.setattr(backbone_module, "map_tasks", one_failure)
-    with RunDirectory(tmp_path / "out") as run, QuietReporter(sys.stderr).stage("mapping", total=1) as stage:
+    monkeypatch.setattr(TaskPool, "map", one_failure)
+    with (
+        RunDirectory(tmp_path / "out") as run,
+        QuietReporter(sys.stderr).stage("mapping", total=1) as stage,
+        TaskPool(workers=1) as pool,
+    ):
         backbone = backbone_of(synthetic[0], run)
         folder = run.stage("segments", "0000", "calibrated", key="k")
-        (found,) = backbone._finish(map_segment, [synthetic[0]], [folder], [kept], stage)
+        (found,) = backbone._finish(map_segment, [synthetic[0]], [folder], [kept], stage, pool)
         assert not folder.is_done
     assert found.models == kept.models
     assert found.attempts == ("calibrated: out of memory",)
@@ -498,8 +545,8 @@ def test_a_global_mapper_that_kills_its_process_costs_only_its_own_rung(
 ) -> None:
     monkeypatch.setattr(backbone_module, "map_segment", die_in_the_global_mapper)
     task = synthetic[0]
-    with RunDirectory(tmp_path / "out") as run:
-        (mapped,) = backbone_of(task, run)._map([Segment(index=0, images=task.images)], {0: task.pairs})
+    with RunDirectory(tmp_path / "out") as run, TaskPool(workers=1) as pool:
+        (mapped,) = backbone_of(task, run)._map([Segment(index=0, images=task.images)], {0: task.pairs}, pool)
     assert mapped.models[0].images == tuple(range(6))
 
 
@@ -517,11 +564,11 @@ def backbone_of(task: MappingTask, run: RunDirectory) -> ClassicalBackbone:
 def test_a_sweep_that_failed_leaves_readable_empty_maps_and_is_tried_again(
     synthetic: tuple[MappingTask, pycolmap.Reconstruction], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(backbone_module, "map_tasks", one_failure)
+    monkeypatch.setattr(TaskPool, "map", one_failure)
     piece = make_piece(walk(3), (0, 1, 2), points_ahead(9, np.random.default_rng(0)), Sim3.identity())
-    with RunDirectory(tmp_path / "out") as run:
+    with RunDirectory(tmp_path / "out") as run, TaskPool(workers=1) as pool:
         backbone = backbone_of(synthetic[0], run)
-        (maps,), _ = backbone._dense([piece], with_maps=[piece.segment])
+        (maps,), _ = backbone._dense([piece], [piece.segment], pool)
         assert not backbone._depth_task(piece).folder.is_done
     assert len(maps) == 3
     assert maps.depth(2).shape == (288, 384)

@@ -16,7 +16,7 @@ import pytest
 import trimesh
 from read_colmap_independently import read_binary
 
-from smust3r_colmap.backbones.classical import backbone
+from smust3r_colmap.backbones.classical import backbone, calibration
 from smust3r_colmap.backbones.classical.mapping import METHOD_VERSION
 from smust3r_colmap.config import (
     AlignmentConfig,
@@ -367,8 +367,16 @@ def round_trip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_walk_that_comes_back_is_closed_and_a_run_without_loops_is_not(round_trip: Path, tmp_path: Path) -> None:
+def test_a_walk_that_comes_back_is_closed_and_a_run_without_loops_is_not(
+    round_trip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(calibration, "PILOT_IMAGES", 30)  # three windows are pilots, four follow them
     summary = run(round_trip / "images", tmp_path / "out", ROUND)
+    mapped, adjusted = (
+        list((tmp_path / "out/work/segments").glob(f"*/{stage}")) for stage in ("mapping", "calibrated")
+    )
+    assert sorted(path.parent.name for path in adjusted) == ["0000", "0002", "0004"]
+    assert len(mapped) == len(summary.segments)
     assert len(summary.models) == 1
     closed = [loop for loop in summary.loops if loop.accepted]
     assert closed, [loop.reason for loop in summary.loops]

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
+from smust3r_colmap.geometry.so3 import angles_between, nearest_rotation
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -57,6 +58,19 @@ def test_matrix_product_is_composition_and_round_trips() -> None:
     np.testing.assert_allclose((c_from_b @ b_from_a).matrix, c_from_b.matrix @ b_from_a.matrix, atol=1e-12)
     assert_same(Sim3.from_matrix(b_from_a.matrix), b_from_a)
     assert_same(Sim3.from_matrix(b_from_a.matrix[..., :3, :]), b_from_a)
+
+
+def test_the_nearest_rotation_is_one_even_to_a_mirror_image() -> None:
+    rng = np.random.default_rng(5)
+    rotation = Rotation.random(6, random_state=5).as_matrix()
+    first = rng.normal(size=(6, 40, 3))
+    second = first @ np.swapaxes(rotation, 1, 2) + 1e-3 * rng.normal(size=first.shape)
+    found = nearest_rotation(np.swapaxes(second, 1, 2) @ first)
+    assert angles_between(found, rotation).max() < 1e-3
+    mirrored = nearest_rotation(np.diag([1.0, 1.0, -0.1]) @ rotation)
+    assert np.linalg.det(mirrored) == pytest.approx(1.0)
+    np.testing.assert_allclose(mirrored, rotation, atol=1e-12)
+    assert np.isnan(nearest_rotation(np.full((3, 3), np.nan))).all()
 
 
 def test_long_product_stays_a_rotation() -> None:

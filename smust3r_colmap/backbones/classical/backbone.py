@@ -31,7 +31,7 @@ from smust3r_colmap.backbones.classical.mapping import METHOD_VERSION, MappedSeg
 from smust3r_colmap.backbones.classical.run_features import describe_images, features_of_run
 from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
 from smust3r_colmap.config import ClassicalConfig
-from smust3r_colmap.execution import TaskFailure, map_tasks
+from smust3r_colmap.execution import TaskFailure, TaskPool
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import (
     DenseMaps,
@@ -93,9 +93,10 @@ class ClassicalBackbone:
     def reconstruct(self, segments: Sequence[Segment], *, with_maps: Collection[int]) -> BackboneResult:
         """All segments of the run; see ``Backbone``."""
         pairs = self._match(segments)
-        mapped = self._map(segments, pairs)
-        reconstructions = [_reconstruction(one) for one in mapped]
-        dense, dense_key = self._dense([p for r in reconstructions for p in r.pieces], with_maps)
+        with TaskPool(workers=self.workers, log_file=self.run.native_log) as pool:
+            mapped = self._map(segments, pairs, pool)
+            reconstructions = [_reconstruction(one) for one in mapped]
+            dense, dense_key = self._dense([p for r in reconstructions for p in r.pieces], with_maps, pool)
         return BackboneResult(
             reconstructions=tuple(reconstructions),
             dense=dense,
@@ -140,7 +141,9 @@ class ClassicalBackbone:
         return plan_pairs(segment, neighbours=neighbours, exhaustive_below=self.config.exhaustive_below)
 
     # --------------------------------------------------------------- every segment
-    def _map(self, segments: Sequence[Segment], pairs: Mapping[int, tuple[Pair, ...]]) -> list[MappedSegment]:
+    def _map(
+        self, segments: Sequence[Segment], pairs: Mapping[int, tuple[Pair, ...]], pool: TaskPool
+    ) -> list[MappedSegment]:
         """Map pilots freely, agree on the cameras, map the other segments with these, bring the pilots to them.
 
         Windows alone have a say about the cameras, so a loop that is found later changes no window.
@@ -148,14 +151,14 @@ class ClassicalBackbone:
         tasks = {segment.index: self._mapping_task(segment, pairs[segment.index]) for segment in segments}
         windows = [tasks[segment.index] for segment in segments if segment.kind == "window"]
         first = tasks if self.collection.calibrated else {task.segment: task for task in choose_pilots(windows)}
-        mapped = self._map_all("mapping", list(first.values()))
+        mapped = self._map_all("mapping", list(first.values()), pool)
         known = self._agreed_cameras(segments, mapped)
         for segment in segments:
             if segment.index not in first:
                 tasks[segment.index] = replace(tasks[segment.index], trusted=known[segment.kind])
         rest = [task for task in tasks.values() if task.segment not in first]
         if rest:
-            mapped |= self._map_all("mapping with the cameras found", rest)
+            mapped |= self._map_all("mapping with the cameras found", rest, pool)
         free = {index: one for index, one in mapped.items() if one.models and not tasks[index].calibrated}
         agreed = self._agreed_cameras(segments, free)
         for camera, intrinsics in (agreed["window"] | known["window"]).items():
@@ -169,34 +172,35 @@ class ClassicalBackbone:
                     mapping=tasks[index], mapped=one, agreed={**agreed[kind_of[index]], **tasks[index].trusted}
                 )
                 for index, one in free.items()
-            ]
+            ],
+            pool,
         )
         return [mapped[segment.index] for segment in segments]
 
-    def _map_all(self, name: str, tasks: Sequence[MappingTask]) -> dict[int, MappedSegment]:
+    def _map_all(self, name: str, tasks: Sequence[MappingTask], pool: TaskPool) -> dict[int, MappedSegment]:
         """What the mappers make of segments, by segment; where they bring the process down, without the global one."""
         folders = [self._segment_stage(task.segment, "mapping", self._mapping_key(task)) for task in tasks]
         with self.reporter.stage(name, total=len(tasks)) as stage:
-            mapped = self._finish(map_segment, tasks, folders, [_nothing(task) for task in tasks], stage)
+            mapped = self._finish(map_segment, tasks, folders, [_nothing(task) for task in tasks], stage, pool)
         crashed = [k for k, one in enumerate(mapped) if not one.models and not folders[k].is_done]
         if crashed:
             with self.reporter.stage("mapping without the global mapper", total=len(crashed)) as stage:
                 careful = [replace(tasks[k], use_global=False) for k in crashed]
                 again = self._finish(
-                    map_segment, careful, [folders[k] for k in crashed], [mapped[k] for k in crashed], stage
+                    map_segment, careful, [folders[k] for k in crashed], [mapped[k] for k in crashed], stage, pool
                 )
             for k, one in zip(crashed, again, strict=True):
                 mapped[k] = one
         return {one.segment: one for one in mapped}
 
-    def _calibrate_all(self, tasks: Sequence[CalibrationTask]) -> dict[int, MappedSegment]:
+    def _calibrate_all(self, tasks: Sequence[CalibrationTask], pool: TaskPool) -> dict[int, MappedSegment]:
         """Freely mapped segments brought to the agreed cameras, by segment."""
         keys = [key_of("calibrated", self._mapping_key(task.mapping), sorted(task.agreed.items())) for task in tasks]
         folders = [
             self._segment_stage(task.mapping.segment, "calibrated", key) for task, key in zip(tasks, keys, strict=True)
         ]
         with self.reporter.stage("calibration", total=len(tasks)) as stage:
-            calibrated = self._finish(calibrate_segment, tasks, folders, [task.mapped for task in tasks], stage)
+            calibrated = self._finish(calibrate_segment, tasks, folders, [task.mapped for task in tasks], stage, pool)
         return {one.segment: one for one in calibrated}
 
     def _mapping_key(self, task: MappingTask) -> str:
@@ -237,6 +241,7 @@ class ClassicalBackbone:
         folders: Sequence[StageFolder],
         otherwise: Sequence[MappedSegment],
         stage: Stage,
+        pool: TaskPool,
     ) -> list[MappedSegment]:
         """Run what no earlier start finished, store it, and return everything in order.
 
@@ -247,7 +252,7 @@ class ClassicalBackbone:
         stage.skip(len(tasks) - len(missing))
         failed = {}
         todo = [tasks[k] for k in missing]
-        for result in map_tasks(function, todo, workers=self.workers, log_file=self.run.native_log):
+        for result in pool.map(function, todo):
             k = missing[result.index]
             if isinstance(result.value, TaskFailure):
                 failed[k] = _with_failure(otherwise[k], folders[k].path.name, result.value)
@@ -258,7 +263,9 @@ class ClassicalBackbone:
             stage.advance()
         return [failed[k] if k in failed else read_mapped(folder.path) for k, folder in enumerate(folders)]
 
-    def _dense(self, pieces: Sequence[SegmentPiece], with_maps: Collection[int]) -> tuple[tuple[DenseMaps, ...], str]:
+    def _dense(
+        self, pieces: Sequence[SegmentPiece], with_maps: Collection[int], pool: TaskPool
+    ) -> tuple[tuple[DenseMaps, ...], str]:
         """Maps of every piece and their common key; a piece whose sweep failed gets empty ones and a warning."""
         tasks = [self._depth_task(piece) for piece in pieces]
         wanted = [task for task in tasks if task.piece.segment in with_maps]
@@ -266,7 +273,7 @@ class ClassicalBackbone:
         total = sum(len(task.images) for task in wanted)
         with self.reporter.stage("depth", total=total) as stage:
             stage.skip(total - sum(len(task.images) for task in missing))
-            for result in map_tasks(make_depth, missing, workers=self.workers, log_file=self.run.native_log):
+            for result in pool.map(make_depth, missing):
                 task = missing[result.index]
                 if isinstance(result.value, TaskFailure):
                     self.reporter.warn(f"segment {task.piece.name} has no depth maps: {result.value.reason}")
