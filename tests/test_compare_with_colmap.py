@@ -390,7 +390,7 @@ def never(*_: object, **__: object) -> Cost:
 def test_reuse_runs_nothing_and_measures_what_is_there(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compare, "run_child", never)
     results = run_script(finished, monkeypatch, "--reuse", "--stages")
-    ours = results["ours l=60 p=30"]
+    ours = results["ours l=60 p=20"]
     assert set(results) == {ours.method, INCREMENTAL, GLOBAL}
     assert {stage: one.cpu_s for stage, one in ours.costs.items()} == {
         "features": 5.0,
@@ -410,7 +410,7 @@ def test_without_refinement_the_result_is_the_stitched_one(finished: Path, monke
     (finished / "work" / "walk" / "ours" / "trajectory_stitched_tum.txt").unlink()
     monkeypatch.setattr(compare, "run_child", never)
     results = run_script(finished, monkeypatch, "--reuse", "--stages")
-    assert list(results["ours l=60 p=30"].stages) == ["chain", "loops"]
+    assert list(results["ours l=60 p=20"].stages) == ["chain", "loops"]
 
 
 def test_ours_is_run_again_beside_what_colmap_left(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
