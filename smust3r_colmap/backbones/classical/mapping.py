@@ -287,15 +287,16 @@ class _Ladder:
         options.min_model_size = self.min_images
         options.max_model_overlap = 20
         # COLMAP adjusts to a function tolerance of 0 whenever a model has grown by a tenth. A segment is adjusted
-        # again under the cameras of the run and in the whole scene, so it needs to converge once, at the end.
-        options.ba_local_function_tolerance = 1e-4
+        # again in the whole scene; only focal length and distortion, in their valley, need the iterations.
+        known = self.task.calibrated
+        options.ba_local_function_tolerance = 1e-2
         options.ba_local_max_refinements = 1
-        options.ba_global_function_tolerance = 1e-5
-        options.ba_global_max_refinements = 2
+        options.ba_global_function_tolerance = 1e-3 if known else 1e-5
+        options.ba_global_max_refinements = 1 if known else 2
         options.ba_global_frames_ratio = 1.4
         options.ba_global_points_ratio = 1.4
-        options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not self.task.calibrated
-        options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = not self.task.calibrated
+        options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not known
+        options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = not known
         options.mapper.num_threads = 1
         options.mapper.random_seed = self.task.seed
         options.triangulation.random_seed = self.task.seed
