@@ -289,7 +289,7 @@ class _Ladder:
         # COLMAP adjusts to a function tolerance of 0 whenever a model has grown by a tenth. A segment is adjusted
         # again in the whole scene; only focal length and distortion, in their valley, need the iterations.
         known = self.task.calibrated
-        options.ba_local_function_tolerance = 1e-2
+        options.ba_local_function_tolerance = 1e-2 if known else 1e-4
         options.ba_local_max_refinements = 1
         options.ba_global_function_tolerance = 1e-3 if known else 1e-5
         options.ba_global_max_refinements = 1 if known else 2
