@@ -86,9 +86,7 @@ class TaskPool:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *exc: object) -> None:
-        if kind is not None:
-            self._kill()
-        self._shut_down()
+        self._shut_down(kill=kind is not None)
         _open_pools.remove(self)
 
     @property
@@ -132,11 +130,10 @@ class TaskPool:
         except BrokenProcessPool:
             suspects = sorted(in_flight.values())
             logger.warning("a child process died; running %d tasks again one by one", len(suspects))
-            self._shut_down()
+            self._shut_down(kill=False)
             return suspects
         except BaseException:
-            self._kill()
-            self._shut_down()
+            self._shut_down(kill=True)
             raise
         return []
 
@@ -150,13 +147,10 @@ class TaskPool:
             )
         return self._executor
 
-    def _kill(self) -> None:
+    def _shut_down(self, *, kill: bool) -> None:
         if self._executor is not None:
-            for process in list((self._executor._processes or {}).values()):
+            for process in list((self._executor._processes or {}).values()) if kill else []:
                 process.kill()
-
-    def _shut_down(self) -> None:
-        if self._executor is not None:
             # Waiting lets the system count the children's processor time as ours.
             self._executor.shutdown(wait=True, cancel_futures=True)
         self._executor = None

@@ -407,8 +407,9 @@ def read_only_segment(number: int, model: MappedModel) -> MappedSegment:
 def test_one_odd_camera_of_many_does_not_condemn_a_model() -> None:
     model = model_of_walk(8)
     camera_of = {image: image for image in model.images}
-    assert diverged_focal(model, camera_of, {3: 900.0}) == ""
-    odd = dict.fromkeys(range(5), 900.0)
+    other = replace(CAMERA, params=(900.0, 900.0, *CAMERA.params[2:]))
+    assert diverged_focal(model, camera_of, {3: other}) == ""
+    odd = dict.fromkeys(range(5), other)
     assert diverged_focal(model, camera_of, odd) == "focal length 500 px, the run's is 900 px"
 
 

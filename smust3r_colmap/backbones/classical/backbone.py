@@ -165,16 +165,16 @@ class ClassicalBackbone:
             self.reporter.note(
                 f"camera {camera + 1}: the segments agree on a focal length of {intrinsics.focal_px:.1f} px"
             )
-        kind_of = {segment.index: segment.kind for segment in segments}
-        mapped |= self._calibrate_all(
-            [
-                CalibrationTask(
-                    mapping=tasks[index], mapped=one, agreed={**agreed[kind_of[index]], **tasks[index].trusted}
-                )
-                for index, one in free.items()
-            ],
-            pool,
-        )
+        calibrations = [
+            CalibrationTask(
+                mapping=tasks[segment.index],
+                mapped=free[segment.index],
+                agreed={**agreed[segment.kind], **tasks[segment.index].trusted},
+            )
+            for segment in segments
+            if segment.index in free
+        ]
+        mapped |= self._calibrate_all(calibrations, pool)
         return [mapped[segment.index] for segment in segments]
 
     def _map_all(self, name: str, tasks: Sequence[MappingTask], pool: TaskPool) -> dict[int, MappedSegment]:

@@ -114,9 +114,8 @@ def calibrate_segment(task: CalibrationTask) -> MappedSegment:
     The new models replace all old ones, unless they place fewer images than the sound ones among the old.
     """
     mapped = task.mapped
-    trusted = {camera: intrinsics.focal_px for camera, intrinsics in task.agreed.items()}
-    camera_of = dict(zip(task.mapping.images, task.mapping.camera_indices, strict=True))
-    sound = [model for model in mapped.models if not diverged_focal(model, camera_of, trusted)]
+    camera_of = task.mapping.camera_of
+    sound = [model for model in mapped.models if not diverged_focal(model, camera_of, task.agreed)]
     placed = placed_images(sound)
     if len(placed) >= ENOUGH_REGISTERED * len(task.mapping.images):
         mapped = replace(mapped, models=tuple(sound), unregistered=left_over(task.mapping, sound, mapped.unregistered))
@@ -179,7 +178,7 @@ def _adjust(model: MappedModel, task: CalibrationTask) -> tuple[MappedModel, str
 def reconstruction_from_model(model: MappedModel, task: CalibrationTask) -> pycolmap.Reconstruction:
     """A pycolmap model with the agreed cameras in place of its own, where there are any."""
     mapping = task.mapping
-    camera_of = dict(zip(mapping.images, mapping.camera_indices, strict=True))
+    camera_of = mapping.camera_of
     reconstruction = pycolmap.Reconstruction()
     for camera in sorted({camera_of[image] for image in model.images}):
         own = next(i for image, i in zip(model.images, model.intrinsics, strict=True) if camera_of[image] == camera)

@@ -86,6 +86,11 @@ class MappingTask:
     use_global: bool = True
 
     @property
+    def camera_of(self) -> dict[int, int]:
+        """Camera index by image."""
+        return dict(zip(self.images, self.camera_indices, strict=True))
+
+    @property
     def calibrated(self) -> bool:
         """All cameras of the segment are known."""
         return self.trusted.keys() >= set(self.camera_indices)
@@ -255,9 +260,8 @@ class _Ladder:
 
     def _from_chosen_pair(self, database: str, pairs: Sequence[Pair]) -> dict[int, pycolmap.Reconstruction]:
         """One model from the best pair that gives one; nothing where none does."""
-        camera_of = dict(zip(self.task.images, self.task.camera_indices, strict=True))
         start_cameras = self.task.start_cameras
-        cameras = {image: start_cameras[index] for image, index in camera_of.items()}
+        cameras = {image: start_cameras[index] for image, index in self.task.camera_of.items()}
         with open_database(self.scratch / database) as opened:
             starts = choose_start_pairs(opened, pairs, cameras, seed=self.task.seed)
         for number, start in enumerate(starts):
@@ -339,9 +343,7 @@ class _Ladder:
         """Why a model cannot be believed, or nothing. Its pixels look perfect in every such case."""
         if not np.isfinite(model.reprojection_error_px) or model.reprojection_error_px > 3.0:
             return f"mean reprojection error {model.reprojection_error_px:.2f} px"
-        camera_of = dict(zip(self.task.images, self.task.camera_indices, strict=True))
-        trusted = {camera: intrinsics.focal_px for camera, intrinsics in self.task.trusted.items()}
-        return absurd_focal(model) or diverged_focal(model, camera_of, trusted)
+        return absurd_focal(model) or diverged_focal(model, self.task.camera_of, self.task.trusted)
 
     def _count_jumps(self, models: Sequence[MappedModel]) -> int:
         with open_database(self.task.database) as database:
@@ -391,7 +393,7 @@ class _Ladder:
 
     def _with_own_priors(self, model: MappedModel) -> MappedModel:
         """The model whose cameras call a focal length prior knowledge only where the images' own cameras do."""
-        camera_of = dict(zip(self.task.images, self.task.camera_indices, strict=True))
+        camera_of = self.task.camera_of
         priors = [self.task.cameras[camera_of[image]].has_prior_focal for image in model.images]
         intrinsics = [replace(one, has_prior_focal=prior) for one, prior in zip(model.intrinsics, priors, strict=True)]
         return replace(model, intrinsics=tuple(intrinsics))

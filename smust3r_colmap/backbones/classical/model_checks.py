@@ -15,6 +15,7 @@ import pycolmap
 
 from smust3r_colmap.backbones.classical.features import Pair
 from smust3r_colmap.backbones.classical.mapped_model import MappedModel
+from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 
 MAX_TURN_DEG = 60.0
@@ -53,19 +54,20 @@ def absurd_focal(model: MappedModel) -> str:
     return f"focal length {model.intrinsics[k].focal_px:.0f} px is {ratios[k]:.1f} times the longer side"
 
 
-def diverged_focal(model: MappedModel, camera_of: Mapping[int, int], trusted_focal: Mapping[int, float]) -> str:
+def diverged_focal(model: MappedModel, camera_of: Mapping[int, int], trusted: Mapping[int, Intrinsics]) -> str:
     """How far the focal lengths of most images are from the run's, or nothing.
 
     Args:
-        camera_of: camera index by image. trusted_focal: the run's, by camera index; may lack some.
+        camera_of: camera index by image. trusted: the run's cameras, by index; may lack some.
     """
-    trusted = np.array([trusted_focal.get(camera_of[image], np.nan) for image in model.images])
+    known_focal = {camera: intrinsics.focal_px for camera, intrinsics in trusted.items()}
+    known = np.array([known_focal.get(camera_of[image], np.nan) for image in model.images])
     focal = np.array([one.focal_px for one in model.intrinsics])
-    diverged = np.abs(np.log(focal / trusted)) > np.log1p(FOCAL_TOLERANCE)  # False where the run has none
+    diverged = np.abs(np.log(focal / known)) > np.log1p(FOCAL_TOLERANCE)  # False where the run has none
     if diverged.mean() <= 0.5:
         return ""
     k = int(np.argmax(diverged))
-    return f"focal length {focal[k]:.0f} px, the run's is {trusted[k]:.0f} px"
+    return f"focal length {focal[k]:.0f} px, the run's is {known[k]:.0f} px"
 
 
 def find_jumps(model: MappedModel, inliers: Mapping[Pair, int]) -> list[int]:
