@@ -117,6 +117,18 @@ def import_image_folder(
     return collection_from_scan(scan_image_folder(folder, known=known, workers=workers), config)
 
 
+def check_image_folder(folder: Path) -> None:
+    """Refuse what is no folder, before anything is made or changed for it.
+
+    Raises:
+        CollectionError: there is no such folder.
+    """
+    if not folder.exists():
+        raise CollectionError(f"{folder}: there is no such folder")
+    if not folder.is_dir():
+        raise CollectionError(f"{folder}: is a file; give the folder that holds the images")
+
+
 def check_output_not_inside(images: Path, output: Path) -> None:
     """Refuse to write results among the images, where the next run would read them.
 
@@ -191,10 +203,7 @@ class _Listing:
 
 def _list_folder(folder: Path) -> _Listing:
     """Image files below the folder in natural order."""
-    if not folder.exists():
-        raise CollectionError(f"{folder}: there is no such folder")
-    if not folder.is_dir():
-        raise CollectionError(f"{folder}: is a file; give the folder that holds the images")
+    check_image_folder(folder)
     names: list[str] = []
     unreadable: list[RejectedImage] = []
     other_suffixes: Counter[str] = Counter()

@@ -13,12 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from smust3r_colmap.errors import CollectionError, ImageError, InputError, RunDirectoryError
-from smust3r_colmap.importers.image_folder import ImportRecord
+from smust3r_colmap.exporters.colmap_sparse import MODEL_FILES
+from smust3r_colmap.importers.image_folder import FolderScan, ImportRecord
 from smust3r_colmap.importers.masks import MaskSet, check_masks
 from smust3r_colmap.products import DepthMaps, Scene
 from smust3r_colmap.refinement.task import DATABASE_FILE, MODEL_FOLDER
 from smust3r_colmap.run_directory import RunDirectory, read_json, storage_errors, write_json
 from smust3r_colmap.stored_depth import StoredDepthMaps
+from smust3r_colmap.stored_scan import store_scan
 from smust3r_colmap.stored_scene import read_scenes
 
 FINISHED_FILE = "finished.json"
@@ -65,10 +67,20 @@ def write_finished(run: RunDirectory, finished: FinishedRun) -> None:
     write_json(run.work / FINISHED_FILE, facts)
 
 
-def forget_finished(run: RunDirectory) -> None:
-    """To be called before the stages change: until the run ends again, they do not belong together."""
+def begin_stages(run: RunDirectory, scan: FolderScan, *, fresh: bool) -> None:
+    """To be called before the stages change: until the run ends again, they do not belong together.
+
+    And no earlier than the input is known to be of use, for until then the folder may hold a finished run.
+
+    Args:
+        scan: of the image folder.
+        fresh: throw away all that an earlier run left.
+    """
+    if fresh:
+        run.start_over(MODEL_FILES)
     with storage_errors(run.work):
         (run.work / FINISHED_FILE).unlink(missing_ok=True)
+    store_scan(scan, run)
 
 
 def check_is_finished(root: Path) -> None:

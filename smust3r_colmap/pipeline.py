@@ -40,10 +40,12 @@ from smust3r_colmap.exporters.aside import replace_file
 from smust3r_colmap.exporters.colmap_sparse import MODEL_FILES, refuse_names_text_cannot_hold
 from smust3r_colmap.exporters.tum_trajectory import write_tum
 from smust3r_colmap.exports import FORMATS, FormatSettings, Outputs, write_where_possible
-from smust3r_colmap.finished_run import FinishedRun, forget_finished, write_finished
+from smust3r_colmap.finished_run import FinishedRun, begin_stages, write_finished
 from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.importers.image_folder import (
+    FolderScan,
+    check_image_folder,
     check_masks_not_inside,
     check_output_not_inside,
     collection_from_scan,
@@ -115,14 +117,15 @@ def reconstruct(
     """
     check_output_not_inside(images, output)
     check_masks_not_inside(images, config.importing.masks)
-    with RunDirectory(output, fresh=fresh) as run:
-        forget_finished(run)
+    check_image_folder(images)
+    with RunDirectory(output) as run:
         clock = StageClock(reporter)
-        collection = _import(images, config, run, clock)
+        scan, collection = _import(images, config, run, clock, fresh=fresh)
+        backbone = _backbone(factory, collection, config, run, clock)
+        begin_stages(run, scan, fresh=fresh)
         windows = plan_windows(
             len(collection), segment_length=config.segmentation.segment_length, overlap=config.segmentation.overlap
         )
-        backbone = _backbone(factory, collection, config, run, clock)
         plan = _find_loops(backbone, windows, config, run, clock)
         segments = (*windows, *(loop.segment for loop in plan.loops))
         result = backbone.reconstruct(segments, with_maps=_segments_with_maps(backbone, segments, config))
@@ -142,10 +145,12 @@ def reconstruct(
     return summary
 
 
-def _import(images: Path, config: RunConfig, run: RunDirectory, clock: StageClock) -> ImageCollection:
-    """Read the folder; files that did not change since an earlier start are not decoded again."""
+def _import(
+    images: Path, config: RunConfig, run: RunDirectory, clock: StageClock, *, fresh: bool
+) -> tuple[FolderScan, ImageCollection]:
+    """Read the folder, and change nothing in the run's."""
     with clock.stage("import", total=1) as stage:
-        scan = scan_changed_files(images, run, workers=config.workers)
+        scan = scan_changed_files(images, run, fresh=fresh, workers=config.workers)
         collection = collection_from_scan(scan, config.importing)
         if config.output.text:
             refuse_names_text_cannot_hold(image.name for image in collection.images)
@@ -153,7 +158,7 @@ def _import(images: Path, config: RunConfig, run: RunDirectory, clock: StageCloc
         stage.advance()
     for rejected in collection.rejected:
         clock.warn(f"left out: {rejected.name} ({rejected.reason})")
-    return collection
+    return scan, collection
 
 
 def masked_as_wanted(collection: ImageCollection, masks: str, reporter: Reporter) -> ImageCollection:

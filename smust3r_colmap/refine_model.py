@@ -32,12 +32,17 @@ from smust3r_colmap.exporters.aside import replace_file
 from smust3r_colmap.exporters.colmap_sparse import MODEL_FILES, refuse_names_text_cannot_hold
 from smust3r_colmap.exporters.tum_trajectory import write_tum
 from smust3r_colmap.exports import FORMATS, FormatSettings, Outputs, write_where_possible
-from smust3r_colmap.finished_run import FinishedRun, forget_finished, write_finished
+from smust3r_colmap.finished_run import FinishedRun, begin_stages, write_finished
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.importers.colmap_model import ForeignModel, read_colmap_model
 from smust3r_colmap.importers.fitted_model import FittedModel, fit_to_images
-from smust3r_colmap.importers.image_folder import check_masks_not_inside, check_output_not_inside
+from smust3r_colmap.importers.image_folder import (
+    FolderScan,
+    check_image_folder,
+    check_masks_not_inside,
+    check_output_not_inside,
+)
 from smust3r_colmap.importers.masks import masks_of
 from smust3r_colmap.pipeline import masked_as_wanted, refinement_summaries
 from smust3r_colmap.products import FloatArray, ImageCollection, IntArray, PointCloud, RunFeatures, Scene, SegmentPiece
@@ -99,12 +104,13 @@ def refine_model(
     """
     check_output_not_inside(images, output)
     check_masks_not_inside(images, config.importing.masks)
+    check_image_folder(images)
     foreign = read_colmap_model(model)
     _refuse_to_overwrite(foreign.folder, output)
-    with RunDirectory(output, fresh=fresh) as run:
-        forget_finished(run)
+    with RunDirectory(output) as run:
         clock = StageClock(reporter)
-        fitted = _fit(foreign, images, config, cameras, run, clock)
+        scan, fitted = _fit(foreign, images, config, cameras, run, clock, fresh=fresh)
+        begin_stages(run, scan, fresh=fresh)
         start = fitted.scene(origin=foreign.folder.name)
         features = _features(fitted, start, config, run, clock)
         refinement = _refine(fitted, start, features, config, run, clock, tolerance=pose_tolerance)
@@ -123,11 +129,18 @@ def _refuse_to_overwrite(model: Path, output: Path) -> None:
 
 
 def _fit(
-    foreign: ForeignModel, images: Path, config: RunConfig, cameras: CameraChoice, run: RunDirectory, clock: StageClock
-) -> FittedModel:
-    """Files that did not change since an earlier start are not decoded again."""
+    foreign: ForeignModel,
+    images: Path,
+    config: RunConfig,
+    cameras: CameraChoice,
+    run: RunDirectory,
+    clock: StageClock,
+    *,
+    fresh: bool,
+) -> tuple[FolderScan, FittedModel]:
+    """Read the folder and hold the model against it; nothing in the run's folder changes."""
     with clock.stage("import", total=1) as stage:
-        scan = scan_changed_files(images, run, workers=config.workers)
+        scan = scan_changed_files(images, run, fresh=fresh, workers=config.workers)
         fitted = fit_to_images(
             foreign,
             scan,
@@ -144,7 +157,7 @@ def _fit(
         clock.note(remark)
     for rejected in fitted.collection.rejected:
         clock.warn(f"left out: {rejected.name} ({rejected.reason})")
-    return fitted
+    return scan, fitted
 
 
 # --------------------------------------------------------------------------- matching

@@ -64,7 +64,6 @@ class RunDirectory:
 
     Args:
         root: made when missing.
-        fresh: throw away what an earlier run left in ``work`` and the results.
 
     Raises:
         RunLockedError: another living process holds it, and goes on holding it for some seconds.
@@ -85,14 +84,14 @@ class RunDirectory:
         "config.toml",
     )
 
-    def __init__(self, root: Path, *, fresh: bool = False) -> None:
+    def __init__(self, root: Path) -> None:
         self.root = root
         if root.exists() and not root.is_dir():
             raise RunDirectoryError(f"{root}: is a file; --output must name a folder")
         lock = self.work / "lock"
         self._lock = FileLock(lock)
         with storage_errors(root):
-            # A folder "work" alone proves nothing: `fresh` would empty somebody else's.
+            # A folder "work" alone proves nothing: `start_over` would empty somebody else's.
             if root.is_dir() and any(root.iterdir()) and not lock.exists() and not _is_empty_folder(self.work):
                 raise RunDirectoryError(f"{root}: is not empty and was not made by this program; name another folder")
             self.work.mkdir(parents=True, exist_ok=True)
@@ -100,8 +99,6 @@ class RunDirectory:
                 self._lock.acquire(timeout=_LOCK_WAIT_S)
             except Timeout:
                 raise RunLockedError(f"{root}: another process is writing here; wait for it or stop it") from None
-            if fresh:
-                self._clear()
             for left_over in self.work.rglob("*.partial*"):
                 _remove(left_over)
 
@@ -144,11 +141,13 @@ class RunDirectory:
                 if folder.is_dir() and not any(folder.iterdir()):
                     folder.rmdir()
 
-    def _clear(self) -> None:
-        self.clear_results()
-        for path in self.work.iterdir():
-            if path.name != "lock":
-                _remove(path)
+    def start_over(self, model_files: Collection[str]) -> None:
+        """Throw away what an earlier run left: its results, as ``clear_results`` does, and all of ``work``."""
+        self.clear_results(model_files)
+        with storage_errors(self.work):
+            for path in self.work.iterdir():
+                if path.name != "lock":
+                    _remove(path)
 
 
 class StageFolder:

@@ -157,3 +157,15 @@ def _depth(cam_from_world: FloatArray) -> npt.NDArray[np.float32]:
     nearest = np.min(np.where(np.array(walls) > 0, walls, np.inf), axis=0)
     depth: npt.NDArray[np.float32] = nearest.reshape(small.height, small.width).astype(np.float32)
     return depth
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """Of every file below the folder, by its name; but of no lock."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != "lock")
+    return {path.relative_to(folder).as_posix(): _bytes_of(path) for path in files}
+
+
+def _bytes_of(path: Path) -> bytes:
+    """Of a database without the two counters of its header, which pycolmap raises when it only opens one."""
+    data = path.read_bytes()
+    return data[:24] + data[28:92] + data[96:] if path.suffix == ".db" else data

@@ -8,12 +8,14 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pycolmap
 import pytest
 import trimesh
+from finished_runs import content
 from read_colmap_independently import read_binary
 
 from smust3r_colmap.backbones.classical import backbone, calibration
@@ -24,6 +26,7 @@ from smust3r_colmap.config import (
     FusionConfig,
     ImportConfig,
     LoopConfig,
+    Must3rConfig,
     OutputConfig,
     RefinementConfig,
     RunConfig,
@@ -32,7 +35,7 @@ from smust3r_colmap.config import (
 )
 from smust3r_colmap.config_file import config_to_toml
 from smust3r_colmap.demo import DemoScene, demo_intrinsics, write_demo
-from smust3r_colmap.errors import ConfigError, ReconstructionError
+from smust3r_colmap.errors import CollectionError, ConfigError, InputError, ReconstructionError
 from smust3r_colmap.evaluation import compare_trajectories, read_poses_txt, read_reference_sparse
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.progress import QuietReporter
@@ -353,6 +356,55 @@ def test_an_output_among_the_images_is_refused(room: Path) -> None:
     with pytest.raises(ConfigError, match="inside the image folder"):
         run(room / "images", room / "images" / "out")
     assert not (room / "images/out").exists()
+
+
+@pytest.mark.parametrize("fresh", [False, True])
+@pytest.mark.parametrize(
+    ("images", "changes", "match"),
+    [
+        ("photos", {}, "photos: there is no such folder"),
+        ("images", {"importing": ImportConfig(camera_model="PINHOLE", camera_params="1,2")}, "1,2"),
+        ("images", {"importing": ImportConfig(masks="nowhere")}, "nowhere: there is no such folder"),
+        ("images", {"backbone": "must3r", "must3r": Must3rConfig(weights="nowhere.pth")}, r"nowhere\.pth"),
+    ],
+)
+def test_a_typing_error_costs_nothing_of_a_finished_run(
+    images: str,
+    changes: dict[str, Any],
+    match: str,
+    fresh: bool,
+    brief: RunSummary,
+    brief_walk: Path,
+    tmp_path: Path,
+) -> None:
+    output = tmp_path / "out"
+    shutil.copytree(brief.output, output)
+    before = content(output)
+    with pytest.raises(InputError, match=match):
+        reconstruct(
+            brief_walk.parent / images,
+            output,
+            replace(BRIEF, **changes),
+            fresh=fresh,
+            reporter=QuietReporter(sys.stderr),
+        )
+    assert content(output) == before
+
+
+def test_a_folder_that_is_not_there_makes_no_output(tmp_path: Path) -> None:
+    with pytest.raises(CollectionError, match="there is no such folder"):
+        run(tmp_path / "photos", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_starting_over_uses_and_leaves_nothing_of_before(brief: RunSummary, brief_walk: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out"
+    shutil.copytree(brief.output, output)
+    (output / "sparse/7").mkdir()
+    shutil.copy(output / "sparse/0/cameras.bin", output / "sparse/7")
+    again = reconstruct(brief_walk, output, BRIEF, fresh=True, reporter=QuietReporter(sys.stderr))
+    assert not any(reused(again).values())
+    assert [path.name for path in (output / "sparse").iterdir()] == ["0"]
 
 
 # ----------------------------------------------------------------------------- loops

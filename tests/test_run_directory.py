@@ -59,15 +59,20 @@ def test_a_store_opened_in_place_keeps_its_content_until_the_key_changes(tmp_pat
         assert not (run.stage("features", key="k2").open_in_place() / "database.db").exists()
 
 
-def test_fresh_forgets_everything(tmp_path: Path) -> None:
+def test_starting_over_forgets_everything_but_what_somebody_else_put_there(tmp_path: Path) -> None:
     root = tmp_path / "out"
     with RunDirectory(root) as run:
         with run.stage("mapping", key="k").write():
             pass
         (root / "points.ply").write_text("old")
-    with RunDirectory(root, fresh=True) as run:
+        run.sparse_model(0).mkdir(parents=True)
+        (run.sparse_model(0) / "images.bin").write_text("old")
+        (run.sparse_model(0) / "notes.txt").write_text("theirs")
+    with RunDirectory(root) as run:
+        run.start_over({"images.bin"})
         assert not run.stage("mapping", key="k").is_done
-        assert not (root / "points.ply").exists()
+    left = sorted(path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
+    assert left == ["sparse/0/notes.txt", "work/lock"]
 
 
 def test_a_second_process_is_refused_while_the_first_lives(tmp_path: Path) -> None:
@@ -111,15 +116,15 @@ def test_the_same_process_is_refused_too(tmp_path: Path) -> None:
 def test_a_folder_of_somebody_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("years of work")
     with pytest.raises(RunDirectoryError, match="not made by this program"):
-        RunDirectory(tmp_path, fresh=True)
+        RunDirectory(tmp_path)
     assert (tmp_path / "thesis.txt").exists()
 
 
-def test_a_work_folder_of_somebody_else_survives_fresh(tmp_path: Path) -> None:
+def test_a_work_folder_of_somebody_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "work").mkdir()
     (tmp_path / "work/thesis.txt").write_text("years of work")
     with pytest.raises(RunDirectoryError, match="not made by this program"):
-        RunDirectory(tmp_path, fresh=True)
+        RunDirectory(tmp_path)
     assert (tmp_path / "work/thesis.txt").exists()
 
 

@@ -16,8 +16,11 @@ from smust3r_colmap.backbones.base import BackboneContext, BackboneResult
 from smust3r_colmap.backbones.classical.calibration import (
     CalibrationTask,
     agree_on_cameras,
+    are_certain,
     calibrate_segment,
     choose_pilots,
+    is_better,
+    misfits,
 )
 from smust3r_colmap.backbones.classical.dense import DepthTask, make_depth
 from smust3r_colmap.backbones.classical.features import (
@@ -149,16 +152,20 @@ class ClassicalBackbone:
         Windows alone have a say about the cameras, so a loop that is found later changes no window.
         """
         tasks = {segment.index: self._mapping_task(segment, pairs[segment.index]) for segment in segments}
-        windows = [tasks[segment.index] for segment in segments if segment.kind == "window"]
-        first = tasks if self.collection.calibrated else {task.segment: task for task in choose_pilots(windows)}
-        mapped = self._map_all("mapping", list(first.values()), pool)
+        if self.collection.calibrated:
+            mapped = self._map_all("mapping", list(tasks.values()), pool)
+            return [mapped[segment.index] for segment in segments]
+        mapped = self._map_pilots([tasks[segment.index] for segment in segments if segment.kind == "window"], pool)
         known = self._agreed_cameras(segments, mapped)
-        for segment in segments:
-            if segment.index not in first:
-                tasks[segment.index] = replace(tasks[segment.index], trusted=known[segment.kind])
-        rest = [task for task in tasks.values() if task.segment not in first]
+        rest = [
+            replace(tasks[segment.index], trusted=known[segment.kind])
+            for segment in segments
+            if segment.index not in mapped
+        ]
         if rest:
-            mapped |= self._map_all("mapping with the cameras found", rest, pool)
+            found = self._map_known(rest, list(mapped.values()), pool)
+            tasks |= {task.segment: task for task, _ in found}
+            mapped |= {one.segment: one for _, one in found}
         free = {index: one for index, one in mapped.items() if one.models and not tasks[index].calibrated}
         agreed = self._agreed_cameras(segments, free)
         for camera, intrinsics in (agreed["window"] | known["window"]).items():
@@ -177,9 +184,35 @@ class ClassicalBackbone:
         mapped |= self._calibrate_all(calibrations, pool)
         return [mapped[segment.index] for segment in segments]
 
-    def _map_all(self, name: str, tasks: Sequence[MappingTask], pool: TaskPool) -> dict[int, MappedSegment]:
+    def _map_pilots(self, windows: Sequence[MappingTask], pool: TaskPool) -> dict[int, MappedSegment]:
+        """Freely mapped windows, by segment: a few where these agree on the cameras, otherwise all."""
+        pilots = choose_pilots(windows)
+        mapped = self._map_all("mapping", pilots, pool)
+        rest = [task for task in windows if task.segment not in mapped]
+        if rest and not are_certain(list(mapped.values()), [image.camera for image in self.collection.images]):
+            mapped |= self._map_all("mapping of more windows", rest, pool)
+        return mapped
+
+    def _map_known(
+        self, tasks: Sequence[MappingTask], pilots: Sequence[MappedSegment], pool: TaskPool
+    ) -> list[tuple[MappingTask, MappedSegment]]:
+        """Segments mapped with the cameras found, but freely where these do not fit; each with the task that stands."""
+        mapped = self._map_all("mapping with the cameras found", tasks, pool)
+        chosen = {task.segment: (task, mapped[task.segment]) for task in tasks}
+        doubtful = misfits(list(mapped.values()), pilots)
+        if doubtful:
+            again = [replace(task, trusted={}) for task in tasks if task.segment in doubtful]
+            freely = self._map_all("mapping where these do not fit", again, pool, folder="mapping_free")
+            for task in again:
+                if is_better(freely[task.segment], mapped[task.segment]):
+                    chosen[task.segment] = (task, freely[task.segment])
+        return list(chosen.values())
+
+    def _map_all(
+        self, name: str, tasks: Sequence[MappingTask], pool: TaskPool, *, folder: str = "mapping"
+    ) -> dict[int, MappedSegment]:
         """What the mappers make of segments, by segment; where they bring the process down, without the global one."""
-        folders = [self._segment_stage(task.segment, "mapping", self._mapping_key(task)) for task in tasks]
+        folders = [self._segment_stage(task.segment, folder, self._mapping_key(task)) for task in tasks]
         with self.reporter.stage(name, total=len(tasks)) as stage:
             mapped = self._finish(map_segment, tasks, folders, [_nothing(task) for task in tasks], stage, pool)
         crashed = [k for k, one in enumerate(mapped) if not one.models and not folders[k].is_done]

@@ -3,8 +3,10 @@
 Self-calibration inside a short segment is weak: focal lengths of neighbouring segments differ by
 some percent, and now and then one diverges (853 px for 525). Segments whose cameras differ do not
 fit together by any similarity. So the run agrees on one set of intrinsics per camera: a few windows,
-the pilots, are mapped freely, and every other segment with the median of what they found. Then the
-pilots' models are adjusted to it; one that had diverged is mapped again under the agreed values.
+the pilots, are mapped freely, and every other segment with the median of what they found. Where the
+pilots do not agree, all windows are mapped freely, and so is a segment whose pixels do not fit the
+cameras found: a focal length that is off by two percent can fold a segment with little parallax. Then
+freely mapped models are adjusted to the median; one that had diverged is mapped again under it.
 The next module to read is ``dense``.
 """
 
@@ -29,12 +31,14 @@ from smust3r_colmap.statistics import weighted_median
 
 logger = logging.getLogger(__name__)
 
-MAX_ERROR_GROWTH = 1.25
+MAX_ERROR_GROWTH, ERROR_SLACK_PX = 1.25, 0.05
 """A model that fits the agreed cameras worse than this keeps its own."""
 PILOTS = 3
 """Windows, at least, that a camera's parameters are found in: one may be wrong."""
 PILOT_IMAGES = 150
 """Images of a camera in them: three windows of the usual length, more where windows are short and each knows less."""
+MAX_FOCAL_UNCERTAINTY = 0.02
+"""Relative standard error of the median of the pilots' focal lengths, above which they do not agree."""
 MIN_PILOT_SHARE = 1 / 3
 """Share of a window's images that have to be of a camera if the window is to tell of it."""
 
@@ -74,6 +78,49 @@ def choose_pilots(windows: Sequence[MappingTask]) -> list[MappingTask]:
                 num_windows[camera] += 1
                 num_images[camera] += count
     return pilots
+
+
+def are_certain(
+    pilots: Sequence[MappedSegment], camera_of_image: Sequence[int], *, limit: float = MAX_FOCAL_UNCERTAINTY
+) -> bool:
+    """The focal lengths of every camera scatter so little that their median can be relied on.
+
+    The standard error of a median of n values is 1.25 sigma / sqrt(n), with sigma from the median absolute
+    deviation, for one of the pilots may have diverged. A camera that one model alone has seen is not certain.
+    """
+    focal: dict[int, list[float]] = {}
+    for model in (model for pilot in pilots for model in pilot.models):
+        for camera, one in {
+            camera_of_image[i]: one for i, one in zip(model.images, model.intrinsics, strict=True)
+        }.items():
+            focal.setdefault(camera, []).append(float(np.log(one.focal_px)))
+    scatter = {camera: np.abs(logs - np.median(logs)) for camera, logs in focal.items()}
+    return all(
+        len(off) > 1 and 1.25 * 1.4826 * float(np.median(off)) / np.sqrt(len(off)) <= limit for off in scatter.values()
+    )
+
+
+def misfits(with_known: Sequence[MappedSegment], pilots: Sequence[MappedSegment]) -> list[int]:
+    """Segments, of those mapped with the cameras found, whose pixels are clearly worse off than the pilots'."""
+    usual = [mean_error_px(pilot) for pilot in pilots if pilot.models]
+    return [one.segment for one in with_known if one.models and usual and fits_worse(one, float(np.median(usual)))]
+
+
+def fits_worse(mapped: MappedSegment, error_px: float) -> bool:
+    """Its mean reprojection error has grown beyond ``error_px`` by more than chance explains."""
+    return not mean_error_px(mapped) < MAX_ERROR_GROWTH * error_px + ERROR_SLACK_PX
+
+
+def is_better(free: MappedSegment, known: MappedSegment) -> bool:
+    """A segment is better mapped freely: no image is lost, and its pixels fit clearly better."""
+    no_fewer = len(placed_images(free.models)) >= len(placed_images(known.models))
+    return bool(free.models) and no_fewer and fits_worse(known, mean_error_px(free))
+
+
+def mean_error_px(mapped: MappedSegment) -> float:
+    """Mean reprojection error over the points of all models, of which there is at least one."""
+    errors = [model.reprojection_error_px for model in mapped.models]
+    return float(np.average(errors, weights=[max(len(model.tracks.points_seg), 1) for model in mapped.models]))
 
 
 def agree_on_cameras(
@@ -165,7 +212,7 @@ def _adjust(model: MappedModel, task: CalibrationTask) -> tuple[MappedModel, str
     reconstruction.update_point_3d_errors()
     adjusted = model_from_reconstruction(reconstruction, model.method)
     before, after = model.reprojection_error_px, adjusted.reprojection_error_px
-    worse = len(adjusted.images) < len(model.images) or not after < MAX_ERROR_GROWTH * before + 0.05
+    worse = len(adjusted.images) < len(model.images) or not after < MAX_ERROR_GROWTH * before + ERROR_SLACK_PX
     kept_points = len(adjusted.tracks.points_seg) / max(len(model.tracks.points_seg), 1)
     if worse or kept_points < 0.7:
         return (
