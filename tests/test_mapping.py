@@ -21,8 +21,11 @@ from smust3r_colmap.backbones.classical.backbone import ClassicalBackbone
 from smust3r_colmap.backbones.classical.calibration import (
     CalibrationTask,
     agree_on_cameras,
+    are_certain,
     calibrate_segment,
     choose_pilots,
+    is_better,
+    misfits,
 )
 from smust3r_colmap.backbones.classical.descriptors import vlad_descriptors
 from smust3r_colmap.backbones.classical.features import (
@@ -387,17 +390,58 @@ def test_the_weighted_median_follows_the_weight() -> None:
     assert weighted_median(np.array([5.0]), np.array([0.1])) == 5.0
 
 
+START = Intrinsics(model="SIMPLE_RADIAL", width=640, height=480, params=(700.0, 320.0, 240.0, 0.0))
+
+
+def with_focal(focal: float) -> MappedModel:
+    return replace(model_of_walk(6), intrinsics=(replace(START, params=(focal, 320.0, 240.0, 0.01)),) * 6)
+
+
 def test_one_diverged_segment_does_not_move_the_agreed_camera() -> None:
-    model = model_of_walk(6)
-    start = Intrinsics(model="SIMPLE_RADIAL", width=640, height=480, params=(700.0, 320.0, 240.0, 0.0))
-
-    def with_focal(focal: float) -> MappedModel:
-        return replace(model, intrinsics=(replace(start, params=(focal, 320.0, 240.0, 0.01)),) * 6)
-
     segments = [read_only_segment(k, with_focal(focal)) for k, focal in enumerate([520.0, 525.0, 853.0, 528.0, 526.0])]
-    agreed = agree_on_cameras(segments, [0] * 6, [start])
+    agreed = agree_on_cameras(segments, [0] * 6, [START])
     assert agreed[0].params[0] == pytest.approx(526.0, abs=2.0)
     assert agreed[0].params[3] == pytest.approx(0.01)
+
+
+def test_a_diverged_pilot_of_three_does_not_pull_the_agreed_camera() -> None:
+    segments = [read_only_segment(k, with_focal(focal)) for k, focal in enumerate([494.0, 515.0, 1186.0])]
+    assert 494 <= agree_on_cameras(segments, [0] * 6, [START])[0].params[0] <= 515
+    apart = [read_only_segment(k, with_focal(focal)) for k, focal in enumerate([400.0, 900.0])]
+    assert 400 < agree_on_cameras(apart, [0] * 6, [START])[0].params[0] < 900
+
+
+@pytest.mark.parametrize(
+    ("focal", "certain"),
+    [
+        ([315.6, 315.9, 316.4], True),
+        ([515.0, 517.0, 1186.0], True),  # one that diverged among others that agree
+        ([494.0, 515.0, 1186.0], False),
+        ([500.0, 560.0], False),
+        ([500.0], False),
+        ([], False),
+    ],
+)
+def test_pilots_are_relied_on_where_they_agree(focal: list[float], certain: bool) -> None:
+    pilots = [read_only_segment(k, with_focal(one)) for k, one in enumerate(focal)]
+    assert are_certain({0}, pilots, [0] * 6) is certain
+    assert are_certain((), pilots, [0] * 6)  # of no camera there is nothing to know
+    assert not are_certain({0, 1}, pilots, [0] * 6)
+
+
+def test_segments_are_misfits_where_their_pixels_are_clearly_worse_than_the_pilots() -> None:
+    def with_error(number: int, error_px: float) -> MappedSegment:
+        return read_only_segment(number, replace(with_focal(500.0), reprojection_error_px=error_px))
+
+    pilots = [with_error(0, 0.53), with_error(2, 0.66), with_error(4, 0.71)]
+    nothing = replace(pilots[0], segment=9, models=())
+    assert misfits([with_error(1, 0.86), with_error(3, 1.03), with_error(5, np.nan), nothing], pilots) == [3, 5]
+    assert misfits([with_error(1, 9.0)], [nothing]) == []
+    assert is_better(with_error(3, 0.64), with_error(3, 1.03))
+    assert not is_better(with_error(3, 0.9), with_error(3, 1.03))
+    assert not is_better(nothing, with_error(3, 1.03))
+    smaller = replace(pilots[0], models=(restrict_model(pilots[0].models[0], range(4)),))
+    assert not is_better(smaller, with_error(3, 1.03))
 
 
 def read_only_segment(number: int, model: MappedModel) -> MappedSegment:

@@ -37,6 +37,7 @@ from smust3r_colmap.config_file import config_to_toml
 from smust3r_colmap.demo import DemoScene, demo_intrinsics, write_demo
 from smust3r_colmap.errors import CollectionError, ConfigError, InputError, ReconstructionError
 from smust3r_colmap.evaluation import compare_trajectories, read_poses_txt, read_reference_sparse
+from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.progress import QuietReporter
 from smust3r_colmap.summary import RunSummary
@@ -410,6 +411,7 @@ def test_starting_over_uses_and_leaves_nothing_of_before(brief: RunSummary, brie
 # ----------------------------------------------------------------------------- loops
 NUM_ROUND = 36
 ROUND = replace(CONFIG, segmentation=SegmentationConfig(segment_length=10, overlap=5))
+UNREFINED_ROUND = replace(ROUND, refinement=RefinementConfig(refine=False))
 
 
 @pytest.fixture(scope="module")
@@ -455,6 +457,38 @@ def test_a_walk_that_comes_back_is_closed_and_a_run_without_loops_is_not(
     assert plain.graph.num_loops == 0
     assert not (tmp_path / "out/trajectory_without_loops_tum.txt").exists()
     assert all(was_reused for name, was_reused in reused(plain).items() if name in {"features", "mapping", "depth"})
+
+
+def freely_mapped(output: Path) -> list[str]:
+    return sorted(path.parent.name for path in (output / "work/segments").glob("*/calibrated"))
+
+
+def test_all_windows_find_the_camera_where_the_pilots_do_not_agree(
+    round_trip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(calibration, "PILOT_IMAGES", 30)
+    monkeypatch.setattr(calibration, "MAX_FOCAL_UNCERTAINTY", 0.0)
+    summary = run(round_trip / "images", tmp_path / "out", replace(UNREFINED_ROUND, loop_closing=NO_LOOPS))
+    assert freely_mapped(tmp_path / "out") == [f"{segment.index:04d}" for segment in summary.segments]
+    assert len(summary.segments) == 7
+
+
+def test_segments_that_a_wrong_camera_does_not_fit_are_mapped_freely(
+    round_trip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where three pilots agree by chance: held fixed, a focal length off by some percent folds a segment."""
+
+    def too_long(*args: Any, **kwargs: Any) -> dict[int, Intrinsics]:
+        agreed = calibration.agree_on_cameras(*args, **kwargs)
+        return {k: replace(one, params=(1.1 * one.focal_px, *one.params[1:])) for k, one in agreed.items()}
+
+    monkeypatch.setattr(calibration, "PILOT_IMAGES", 30)
+    monkeypatch.setattr(backbone, "agree_on_cameras", too_long)
+    summary = run(round_trip / "images", tmp_path / "out", replace(UNREFINED_ROUND, loop_closing=NO_LOOPS))
+    again = {path.parent.name for path in (tmp_path / "out/work/segments").glob("*/mapping_free")}
+    assert {"0005", "0006"} <= again <= {"0001", "0003", "0005", "0006"}
+    assert {"0005", "0006"} <= set(freely_mapped(tmp_path / "out"))
+    assert summary.num_registered == NUM_ROUND
 
 
 @pytest.mark.parametrize("group", ["affine3", "sl4"])

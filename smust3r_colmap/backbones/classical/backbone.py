@@ -189,7 +189,8 @@ class ClassicalBackbone:
         pilots = choose_pilots(windows)
         mapped = self._map_all("mapping", pilots, pool)
         rest = [task for task in windows if task.segment not in mapped]
-        if rest and not are_certain(list(mapped.values()), [image.camera for image in self.collection.images]):
+        cameras = {camera for task in rest for camera in task.camera_indices}
+        if not are_certain(cameras, list(mapped.values()), [image.camera for image in self.collection.images]):
             mapped |= self._map_all("mapping of more windows", rest, pool)
         return mapped
 

@@ -14,16 +14,17 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 import pycolmap
 
 from smust3r_colmap.backbones.classical.features import internal_name, open_database
 from smust3r_colmap.backbones.classical.mapped_model import MappedModel, model_from_reconstruction, placed_images
 from smust3r_colmap.backbones.classical.mapping import ENOUGH_REGISTERED, MappedSegment, MappingTask, map_segment
-from smust3r_colmap.backbones.classical.model_checks import diverged_focal
+from smust3r_colmap.backbones.classical.model_checks import FOCAL_TOLERANCE, diverged_focal
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import UnregisteredImage
@@ -80,24 +81,29 @@ def choose_pilots(windows: Sequence[MappingTask]) -> list[MappingTask]:
     return pilots
 
 
-def are_certain(
-    pilots: Sequence[MappedSegment], camera_of_image: Sequence[int], *, limit: float = MAX_FOCAL_UNCERTAINTY
-) -> bool:
-    """The focal lengths of every camera scatter so little that their median can be relied on.
+def are_certain(cameras: Collection[int], pilots: Sequence[MappedSegment], camera_of_image: Sequence[int]) -> bool:
+    """The pilots' focal lengths scatter so little that their median can be relied on for these cameras.
 
-    The standard error of a median of n values is 1.25 sigma / sqrt(n), with sigma from the median absolute
-    deviation, for one of the pilots may have diverged. A camera that one model alone has seen is not certain.
+    Of a camera that one model alone has seen nothing is certain.
     """
-    focal: dict[int, list[float]] = {}
+    log_focal: dict[int, list[float]] = {camera: [] for camera in cameras}
     for model in (model for pilot in pilots for model in pilot.models):
-        for camera, one in {
-            camera_of_image[i]: one for i, one in zip(model.images, model.intrinsics, strict=True)
-        }.items():
-            focal.setdefault(camera, []).append(float(np.log(one.focal_px)))
-    scatter = {camera: np.abs(logs - np.median(logs)) for camera, logs in focal.items()}
+        for camera, intrinsics in _cameras_of(model, camera_of_image).items():
+            log_focal.setdefault(camera, []).append(float(np.log(intrinsics.focal_px)))
     return all(
-        len(off) > 1 and 1.25 * 1.4826 * float(np.median(off)) / np.sqrt(len(off)) <= limit for off in scatter.values()
+        len(log_focal[camera]) > 1 and _median_uncertainty(np.array(log_focal[camera])) <= MAX_FOCAL_UNCERTAINTY
+        for camera in cameras
     )
+
+
+def _median_uncertainty(values: npt.NDArray[np.float64]) -> float:
+    """Standard error of the median: 1.25 sigma / sqrt(n), and sigma as 1.4826 median absolute deviations."""
+    deviation = float(np.median(np.abs(values - np.median(values))))
+    return 1.25 * 1.4826 * deviation / float(np.sqrt(len(values)))
+
+
+def _cameras_of(model: MappedModel, camera_of_image: Sequence[int]) -> dict[int, Intrinsics]:
+    return {camera_of_image[image]: one for image, one in zip(model.images, model.intrinsics, strict=True)}
 
 
 def misfits(with_known: Sequence[MappedSegment], pilots: Sequence[MappedSegment]) -> list[int]:
@@ -133,26 +139,30 @@ def agree_on_cameras(
     """Weighted median of each parameter over the models, by camera index.
 
     A model counts as many times as it has images of the camera and observations per image allow:
-    weight is images of the camera times the square root of its points. Cameras that fewer than
-    ``min_models`` models have seen are left out: one model alone agrees with itself.
+    weight is images of the camera times the square root of its points. Diverged focal lengths do not
+    count. Cameras that fewer than ``min_models`` models have seen are left out: one model alone agrees
+    with itself.
     """
-    params: dict[int, list[tuple[float, tuple[float, ...]]]] = {}
+    seen: dict[int, list[tuple[float, Intrinsics]]] = {}
     for segment in segments:
         for model in segment.models:
-            cameras = [camera_of_image[image] for image in model.images]
-            for camera in sorted(set(cameras)):
-                intrinsics = model.intrinsics[cameras.index(camera)]
-                weight = cameras.count(camera) * float(np.sqrt(len(model.tracks.points_seg)))
-                params.setdefault(camera, []).append((weight, intrinsics.params))
-    agreed = {}
-    for camera, seen in params.items():
-        if len(seen) < min_models:
-            continue
-        weights = np.array([weight for weight, _ in seen])
-        values = np.array([value for _, value in seen])
-        median = tuple(weighted_median(values[:, column], weights) for column in range(values.shape[1]))
-        agreed[camera] = replace(priors[camera], params=median)
-    return agreed
+            count = Counter(camera_of_image[image] for image in model.images)
+            for camera, intrinsics in _cameras_of(model, camera_of_image).items():
+                weight = count[camera] * float(np.sqrt(len(model.tracks.points_seg)))
+                seen.setdefault(camera, []).append((weight, intrinsics))
+    return {
+        camera: replace(priors[camera], params=_median_params(*zip(*models, strict=True)))
+        for camera, models in seen.items()
+        if len(models) >= min_models
+    }
+
+
+def _median_params(weights: Sequence[float], intrinsics: Sequence[Intrinsics]) -> tuple[float, ...]:
+    weight, focal = np.array(weights), np.array([one.focal_px for one in intrinsics])
+    near = np.abs(np.log(focal / weighted_median(focal, weight))) <= np.log1p(FOCAL_TOLERANCE)
+    chosen = near if near.any() else ~near
+    values = np.array([one.params for one in intrinsics])[chosen]
+    return tuple(weighted_median(column, weight[chosen]) for column in values.T)
 
 
 def calibrate_segment(task: CalibrationTask) -> MappedSegment:
