@@ -34,7 +34,7 @@ class Refine:
     """Folder with cameras and images, .bin or .txt, or one with sparse/0 in it; points help, but may be missing."""
     images: Annotated[Path, tyro.conf.arg(metavar="IMAGES")]
     """Folder of the images at full size; files are found by name, base name or name without suffix."""
-    output: Annotated[Path, tyro.conf.arg(metavar="OUT")]
+    output: Annotated[Path, tyro.conf.arg(metavar="OUT")] = Path("refined_out")
     """Folder of the result; made when missing."""
     share_cameras: bool = True
     """Make one camera of those that have one image each and nearly the same focal length."""
@@ -42,6 +42,8 @@ class Refine:
     """COLMAP model of the cameras of the result; by default as they are, but SIMPLE_RADIAL for pinholes."""
     calibrated: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """The cameras are known: leave their parameters as they are."""
+    principal_point: bool = RefinementConfig.principal_point
+    """Let the principal points move where two halves of the points agree on where they are."""
     pose_tolerance: float = 0.03
     """How far from its epipolar line a match may lie at first, as a part of the longer image side. Enough for cameras
     that are 3 degrees and 3 % of the extent off; smaller where the scene has places that look alike."""
@@ -83,7 +85,9 @@ class Refine:
         return RunConfig(
             importing=ImportConfig(masks="" if self.masks is None else str(self.masks)),
             classical=ClassicalConfig(max_image_size=self.max_image_size, max_features=self.max_features),
-            refinement=RefinementConfig(track_neighbours=self.track_neighbours, complete=self.complete),
+            refinement=RefinementConfig(
+                track_neighbours=self.track_neighbours, complete=self.complete, principal_point=self.principal_point
+            ),
             output=OutputConfig(text=self.text, trainer=self.trainer, dense=False),
             workers=self.workers,
             seed=self.seed,

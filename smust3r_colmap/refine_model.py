@@ -25,10 +25,8 @@ from smust3r_colmap.alignment.irls import evenly_chosen
 from smust3r_colmap.backbones.classical.features import match_pairs
 from smust3r_colmap.backbones.classical.run_features import describe_images, features_of_run
 from smust3r_colmap.config import RunConfig
-from smust3r_colmap.config_file import config_to_toml
 from smust3r_colmap.errors import ConfigError, DegenerateAlignmentError
 from smust3r_colmap.execution import usable_cores
-from smust3r_colmap.exporters.aside import replace_file
 from smust3r_colmap.exporters.colmap_sparse import MODEL_FILES, refuse_names_text_cannot_hold
 from smust3r_colmap.exporters.tum_trajectory import write_tum
 from smust3r_colmap.exports import FORMATS, FormatSettings, Outputs, write_where_possible
@@ -114,11 +112,16 @@ def refine_model(
         start = fitted.scene(origin=foreign.folder.name)
         features = _features(fitted, start, config, run, clock)
         refinement = _refine(fitted, start, features, config, run, clock, tolerance=pose_tolerance)
-        _doubt_the_poses(refinement, clock)
+        refinement = _doubting_the_poses(refinement)
         result = _with_points(fitted, start, refinement)
         outputs = _export(result, start, refinement, images, fitted, config, run, clock)
         summary = _summarise(fitted, result, features, refinement, outputs, run, clock)
-        write_json(run.root / "summary.json", {**summary.to_json_dict(), "model_remarks": fitted.remarks})
+        facts = {
+            **summary.to_json_dict(),
+            "model_remarks": fitted.remarks,
+            "settings": {"cameras": cameras, "pose_tolerance": pose_tolerance, "config": config},
+        }
+        write_json(run.root / "summary.json", facts)
     return summary
 
 
@@ -252,16 +255,22 @@ def _refine(
     )
 
 
-def _doubt_the_poses(refinement: Refinement, clock: StageClock) -> None:
+def _doubting_the_poses(refinement: Refinement) -> Refinement:
     """Poses of another meaning look like any others, but hardly a match agrees with them."""
     (figures,) = refinement.figures
     if figures.kept and figures.num_refused_pairs <= figures.num_pairs:
-        return
-    clock.warn(
+        return refinement
+    doubt = (
         f"the matches of {figures.num_pairs} image pairs agree with the poses, those of {figures.num_refused_pairs} do "
         "not; has the model camera centres in place of translations, or poses from camera to world? COLMAP's are "
         "from world to camera"
     )
+    doubted = (
+        replace(figures, doubts=(*figures.doubts, doubt))
+        if figures.kept
+        else replace(figures, reason=f"{figures.reason}; {doubt}")
+    )
+    return replace(refinement, figures=(doubted,))
 
 
 # ---------------------------------------------------------------------------- results
@@ -348,7 +357,6 @@ def _export(
         for name in ("sparse", "ply", "glb", "tum", *(("database",) if has_tracks else ())):
             FORMATS[name].write(finished, settings)
         write_tum(start, run.root / "trajectory_stitched_tum.txt", None)
-        replace_file(run.root / "config.toml", config_to_toml(config).encode())
         write_finished(run, finished)
         stage.advance()
     large = config.output.large_formats if has_tracks else ()

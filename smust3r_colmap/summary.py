@@ -171,9 +171,10 @@ class RefinementStep:
         name: of the step.
         observations_before, observations_after: of tracks of two images or more.
         error_before_px, error_after_px: mean reprojection error of the points.
-        track_length_after: observations per point.
-        images_after: registered.
-        moved_percent, turned_deg: median of the cameras, in percent of the path's extent and in degrees.
+        track_length_before, track_length_after: observations per point.
+        images_before, images_after: registered.
+        moved_percent, max_moved_percent: median and largest of the cameras, in percent of the path's extent.
+        turned_deg: median of the cameras.
         kept: the step stands. reason: why it was undone, or empty.
     """
 
@@ -182,9 +183,12 @@ class RefinementStep:
     observations_after: int
     error_before_px: float
     error_after_px: float
+    track_length_before: float
     track_length_after: float
+    images_before: int
     images_after: int
     moved_percent: float
+    max_moved_percent: float
     turned_deg: float
     kept: bool
     reason: str

@@ -279,6 +279,15 @@ def test_part_is_adjusted_to_the_points_that_others_see_too(round_a_ball: Bench)
     assert tuple(model.camera(1).params) == CAMERA.params
 
 
+def test_part_that_sees_nothing_is_no_divergence(round_a_ball: Bench) -> None:
+    model, _ = round_a_ball.model(round_a_ball.world.cam_from_world)
+    before = poses_of(model)
+    for point_id in list(model.point3D_ids()):
+        model.delete_point3D(point_id)
+    assert adjust_part(model, [6, 7], max_iterations=ITERATIONS, threads=1)
+    assert all((pose == before[i]).all() for i, pose in poses_of(model).items())
+
+
 # --------------------------------------------------------------------- triangulation
 def test_triangulation_leaves_the_poses_and_makes_tracks_of_the_true_points(round_a_ball: Bench) -> None:
     world = round_a_ball.world

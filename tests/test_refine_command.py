@@ -112,8 +112,8 @@ def command(export: Export, output: Path) -> Refine:
     return Refine(model=export.model, images=export.images, output=output, max_features=800, workers=1)
 
 
-def refined(wanted: Refine, warnings: io.StringIO | None = None) -> RunSummary:
-    return run_refine(wanted, QuietReporter(warnings or io.StringIO()))
+def refined(wanted: Refine) -> RunSummary:
+    return run_refine(wanted, QuietReporter(io.StringIO()))
 
 
 @pytest.fixture(scope="module")
@@ -169,8 +169,15 @@ def test_everything_that_was_assumed_is_in_the_summary(result: RunSummary) -> No
 
 def test_the_files_are_those_of_a_reconstruction(result: RunSummary) -> None:
     names = {path.name for path in result.output.iterdir()}
-    assert names >= {"points.ply", "scene.glb", "trajectory_tum.txt", "trajectory_stitched_tum.txt", "config.toml"}
-    assert not names & {"trainer", "dense"}
+    assert names >= {"points.ply", "scene.glb", "trajectory_tum.txt", "trajectory_stitched_tum.txt"}
+    assert not names & {"trainer", "dense", "config.toml"}
+
+
+def test_the_settings_are_in_the_summary(result: RunSummary) -> None:
+    settings = json.loads((result.output / "summary.json").read_text())["settings"]
+    assert settings["pose_tolerance"] == 0.03
+    assert settings["cameras"] == {"share": True, "model": "", "calibrated": False}
+    assert settings["config"]["classical"]["max_features"] == 800
 
 
 def test_the_given_cloud_comes_along_with_the_cameras(export: Export, result: RunSummary) -> None:
@@ -240,9 +247,9 @@ def test_poses_that_no_match_agrees_with_are_doubted_aloud(export: Export, resul
     (model / "images.txt").write_text("".join(f"{' '.join(words)}\n" for words in lines))
     shutil.copytree(result.output / "work/features", tmp_path / "out/work/features")
     (tmp_path / "out/work/lock").touch()
-    warnings = io.StringIO()
-    refined(replace(command(export, tmp_path / "out"), model=model), warnings)
-    assert "camera centres in place of translations" in warnings.getvalue()
+    summary = refined(replace(command(export, tmp_path / "out"), model=model))
+    assert summary.exit_code == 3
+    assert any("camera centres in place of translations" in reason for reason in summary.weak_reasons)
 
 
 def test_photographs_without_a_feature_leave_the_model_as_it_was(export: Export, tmp_path: Path) -> None:

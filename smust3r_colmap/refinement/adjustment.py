@@ -287,9 +287,13 @@ def _turn_back(model: pycolmap.Reconstruction, before: FloatArray) -> None:
 def adjust_part(model: pycolmap.Reconstruction, images: Collection[int], *, max_iterations: int, threads: int) -> bool:
     """Bundle adjustment of some images and the points that they alone see; returns as ``adjust``.
 
+    A part that sees nothing has nothing to adjust, and stays as it is.
+
     Points that other images see too stay where they are and hold the part in its place; intrinsics stay,
     for other images share them.
     """
+    if not any(model.image(image_id).num_points3D for image_id in images):
+        return True
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(images):
         config.add_image(image_id)

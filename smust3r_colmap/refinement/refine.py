@@ -204,11 +204,11 @@ def _wanted_pairs(
         if stored.is_done:
             stage.skip(len(seen))
         else:
-            wanted: set[Pair] = set()
+            # A backbone without features has matched nothing yet, neither neighbours nor images without a pose.
+            near = set() if known else _next_images(range(len(features.usable)))
+            wanted = set(near)
             for surfaces in seen:
-                # A backbone without features has matched nothing yet, not even neighbours.
-                near = set() if known else _next_images(surfaces)
-                wanted |= near | set(select_pairs(surfaces, per_image=per_image, known=near or known))
+                wanted |= set(select_pairs(surfaces, per_image=per_image, known=near or known))
                 stage.advance()
             with stored.write() as folder:
                 write_json(folder / "pairs.json", sorted(wanted))
@@ -219,12 +219,12 @@ def _pairs_for_maps(seen: Sequence[Sequence[SeenSurface]], per_image: int) -> tu
     """The nearest neighbours in order, and the images of other passes that see the same surface."""
     pairs: set[Pair] = set()
     for surfaces in seen:
-        pairs |= _next_images(surfaces) | set(select_pairs(surfaces, per_image=per_image, known=()))
+        images = sorted(surface.image for surface in surfaces)
+        pairs |= _next_images(images) | set(select_pairs(surfaces, per_image=per_image, known=()))
     return tuple(sorted(pairs))
 
 
-def _next_images(surfaces: Sequence[SeenSurface]) -> set[Pair]:
-    images = sorted(surface.image for surface in surfaces)
+def _next_images(images: Sequence[int]) -> set[Pair]:
     return {(a, b) for step in range(1, NEXT_IMAGES + 1) for a, b in zip(images, images[step:], strict=False)}
 
 

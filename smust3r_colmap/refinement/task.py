@@ -133,7 +133,7 @@ class RefinedFigures:
         weak: image indices with too few observations, which keep their stitched place among their neighbours.
         registered: image indices that the stitched scene did not have.
         final: figures of the model as it is stored.
-        kept: the refined model stands; False where it came out worse than the stitched one.
+        kept: the refined model stands; False where no image of it sees enough points to be adjusted by.
         principal_point: what became of it, and why.
         doubts: what speaks against the model, in words.
         reason: why not, or empty.
@@ -347,10 +347,7 @@ def _finished(
     principal_point: str,
 ) -> _Outcome:
     model = bench.model
-    _put_back_weak_images(model, stitched)
-    bench.filter(MAX_ERROR_PX)  # from where it stands now, a weak image does not see all that it saw
-    bench.drop_needless_pairs()
-    weak = weak_images(model)
+    weak = _put_back_weak_images(bench, stitched)
     some_sound = len(weak) < model.num_reg_images()
     bench.mapper.end_reconstruction(False)
     _colour(model, task.collection)
@@ -419,13 +416,26 @@ def _completed(task: RefineTask, features: MatchedFeatures, outcomes: Sequence[_
     return replace(largest, model=completion.model, figures=figures)
 
 
-def _put_back_weak_images(model: pycolmap.Reconstruction, stitched: Mapping[int, FloatArray]) -> None:
-    """Images that rest on too little go where their stitched pose is, seen from the nearest sound image.
+def _put_back_weak_images(bench: Bench, stitched: Mapping[int, FloatArray]) -> list[int]:
+    """Images that rest on too little go where their stitched pose is; returns their ids.
 
-    The adjustment may have moved the neighbourhood; the stitched pose moves along with it. An image that had no
-    stitched pose is given up again.
+    From there they do not see all that they saw, which may leave others with too little.
     """
-    weak = weak_images(model)
+    weak: list[int] = []
+    while True:
+        before, weak = weak, weak_images(bench.model)
+        if weak == before:
+            return weak
+        _put_back(bench.model, weak, stitched)
+        bench.filter(MAX_ERROR_PX)
+        bench.drop_needless_pairs()
+
+
+def _put_back(model: pycolmap.Reconstruction, weak: Sequence[int], stitched: Mapping[int, FloatArray]) -> None:
+    """Each where its stitched pose is, seen from the nearest sound image, which adjustment may have moved.
+
+    An image that had no stitched pose is given up again.
+    """
     sound = sorted(set(model.reg_image_ids()) - set(weak))
     anchors = [i for i in sound if i - 1 in stitched]
     for image_id in weak:
