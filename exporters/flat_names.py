@@ -19,15 +19,15 @@ def flat_names(suffixes: Mapping[str, str]) -> dict[str, str]:
 
     ``left/IMG 1.a.JPG`` becomes ``left_IMG_1_a.jpg``. Where two come out alike, also in another case or with
     another suffix, the later gets a number at its end. Where one name is the end of another (``1.jpg`` and
-    ``11.jpg``) all of them get their number in front.
+    ``11.jpg``) all of them get their number in front, as in ``01_1.jpg``, and what looks like such a number further
+    on is parted by a hyphen (``02_01-1.jpg``), so that the number is where a name begins and nowhere else.
 
     Args:
         suffixes: by old name, the suffix of the new one, such as ``.jpg``.
     """
     stems = _all_different({name: _flat_stem(name) for name in suffixes})
     if _one_ends_another(stem + suffixes[name] for name, stem in stems.items()):
-        digits = len(str(len(stems)))
-        stems = {name: f"{number:0{digits}d}_{stem}" for number, (name, stem) in enumerate(stems.items(), start=1)}
+        stems = _numbered(stems)
     return {name: stem + suffixes[name] for name, stem in stems.items()}
 
 
@@ -47,6 +47,16 @@ def _all_different(stems: Mapping[str, str]) -> dict[str, str]:
         taken.add(candidate.casefold())
         different[name] = candidate
     return different
+
+
+def _numbered(stems: Mapping[str, str]) -> dict[str, str]:
+    """Numbers of one width and ``_`` in front; the stems hold no such number any more, so none ends another."""
+    digits = len(str(len(stems)))
+    looks_numbered = re.compile(rf"(?<=[0-9]{{{digits}}})_")
+    return {
+        name: f"{number:0{digits}d}_{looks_numbered.sub('-', stem)}"
+        for number, (name, stem) in enumerate(stems.items(), start=1)
+    }
 
 
 def _one_ends_another(names: Iterable[str]) -> bool:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -56,11 +57,12 @@ LONGEST_DEPTH_PX = 640
 NORMAL_REACH = 0.02
 """How near, over its distance from the camera, a point of the cloud must be to lend its normal."""
 
-_MAY_HOLD = frozenset(
-    {"images", "masks", "depths", "sparse", "transforms.json", "sparse_pc.ply", "names.json"}
-    | {f"{kind}_{scale}" for kind in ("images", "masks") for scale in range(2, 65)}
-    | {f"images_{scale}_png" for scale in range(2, 65)}  # gsplat's own copies of JPEG
+_OURS = re.compile(
+    r"images|masks|depths|sparse|transforms\.json|sparse_pc\.ply|names\.json"
+    r"|(images|masks)_[1-9][0-9]*"
+    r"|images_[1-9][0-9]*_png"  # gsplat's own copies of JPEG
 )
+"""What a trainer folder holds, of whatever scales."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +131,7 @@ def write_trainer_folder(
     points = _points(pinholes, selection, cloud)
     pixels = [(source, names[source.source.name]) for source in sources.values()]
 
-    with replaced_folder(folder, may_hold=_MAY_HOLD) as partial:
+    with replaced_folder(folder, may_hold=_ours_in(folder)) as partial:
         write_images(pixels, partial, scales)
         without_mask = () if masks is None else write_masks(pixels, masks, partial, scales)
         _write_model(pinholes, partial / "sparse" / "0")
@@ -154,6 +156,12 @@ def write_trainer_folder(
     )
     logger.info("%s: %s", folder, report)
     return report
+
+
+def _ours_in(folder: Path) -> set[str]:
+    """The names in ``folder``, if it is there, that an earlier call may have written."""
+    there = folder.iterdir() if folder.is_dir() else ()
+    return {path.name for path in there if _OURS.fullmatch(path.name)}
 
 
 def _used_cameras(model: pycolmap.Reconstruction) -> list[int]:

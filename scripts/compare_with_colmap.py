@@ -6,7 +6,7 @@
 A data set is a folder, or the name of one in $SMUST3R_DATA (default: ../shared/data beside the
 repository), with ``images/`` and a truth: ``poses.txt``, ``transforms.json`` or
 ``reference_sparse/``. Where it has ``subset_every5.txt``, only the images named there are used,
-unless ``--all-images`` is given.
+unless ``--all-images`` is given; runs of all images then have a working folder of their own.
 
 Every stage runs in a process of its own, so that its CPU seconds, wall time and memory are its
 own; memory is the largest resident size of one process (Linux). COLMAP gets SIFT of images of at
@@ -123,7 +123,9 @@ def parse_arguments(words: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--stages", action="store_true", help="also what each of our stages does to the cameras")
     parser.add_argument(
-        "--reuse", action="store_true", help="take what an earlier comparison finished from the working folder"
+        "--reuse",
+        action="store_true",
+        help="take what an earlier comparison finished from the working folder; ours with the same settings only",
     )
     parser.add_argument("--rerun-ours", action="store_true", help="with --reuse: take only COLMAP's part")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures there, too")
@@ -176,10 +178,16 @@ def read_truth(folder: Path) -> tuple[dict[str, Any], str]:
     return read_reference_sparse(folder / "reference_sparse"), "units"
 
 
+def work_folder(dataset: Dataset, output: Path) -> Path:
+    """Where the runs of a set lie; those of all images stand apart from those of the set's subset."""
+    beside_a_subset = (dataset.images.parent / SUBSET_FILE).exists()
+    return output / (f"{dataset.name}_all" if beside_a_subset else dataset.name)
+
+
 # -------------------------------------------------------------------------- methods
 def run_methods(dataset: Dataset, arguments: argparse.Namespace) -> Iterator[Result]:
     """Run what was asked for, one method after the other."""
-    work = arguments.output / dataset.name
+    work = work_folder(dataset, arguments.output)
     if not arguments.skip_ours:
         for workers in arguments.workers or [0]:
             yield run_ours(dataset, work, arguments, workers=workers)
@@ -199,7 +207,10 @@ def run_methods(dataset: Dataset, arguments: argparse.Namespace) -> Iterator[Res
 
 
 def run_ours(dataset: Dataset, work: Path, arguments: argparse.Namespace, *, workers: int) -> Result:
-    """``smust3r-colmap reconstruct`` from scratch, or what an earlier comparison left with --reuse."""
+    """``smust3r-colmap reconstruct`` from scratch, or what an earlier comparison left with --reuse.
+
+    A run that was made with other settings is refused, for its figures would stand under a wrong label.
+    """
     length = arguments.segment_length or (12 if dataset.name in SHORT_SEGMENTS else 60)
     overlap = arguments.overlap or min(SegmentationConfig().overlap, length // 2)
     settings = ["--segment-length", str(length), "--overlap", str(overlap), *arguments.flags]
@@ -212,6 +223,7 @@ def run_ours(dataset: Dataset, work: Path, arguments: argparse.Namespace, *, wor
     output, record = work / folder, work / f"{folder}.json"
     if arguments.rerun_ours or not (arguments.reuse and record.exists()):
         measure_ours(dataset, output, record, settings)
+    refuse_other_settings(record, settings)
     cost = Cost(**json.loads(record.read_text(encoding="utf-8")))
     summary = output / "summary.json"
     costs = {"rest": cost}
@@ -223,14 +235,32 @@ def run_ours(dataset: Dataset, work: Path, arguments: argparse.Namespace, *, wor
 
 
 def measure_ours(dataset: Dataset, output: Path, record: Path, settings: list[str]) -> None:
-    """Run the command on an empty output folder and write down what it took."""
+    """Run the command on an empty output folder and write down what it took, and beside it the settings."""
+    record.unlink(missing_ok=True)
     shutil.rmtree(output, ignore_errors=True)
     output.parent.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "smust3r_colmap", "reconstruct", str(dataset.images), "--output", str(output)]
     cost = run_child([*command, *settings, "--quiet"], output.with_name(f"{output.name}.log"))
     # 3 is the exit code of a run that finished with a weak result, which the table shows anyway.
     cost = replace(cost, exit_code=0 if cost.exit_code == 3 else cost.exit_code)
+    settings_beside(record).write_text(shlex.join(settings), encoding="utf-8")
     record.write_text(json.dumps(asdict(cost)), encoding="utf-8")
+
+
+def settings_beside(record: Path) -> Path:
+    """The file with the settings that the run of a record was made with, as one would type them."""
+    return record.with_suffix(".settings")
+
+
+def refuse_other_settings(record: Path, settings: list[str]) -> None:
+    """Leave with a message where the run of a record was made with other settings, or does not say with which."""
+    file = settings_beside(record)
+    found = file.read_text(encoding="utf-8") if file.exists() else "settings that it does not tell"
+    if found != shlex.join(settings):
+        sys.exit(
+            f"{record}: was made with {found}, and asked for is {shlex.join(settings)}; "
+            "give --rerun-ours to replace it, or --ours-name for a folder of its own"
+        )
 
 
 def effect_of_stages(dataset: Dataset, output: Path, result: Result) -> dict[str, Evaluation]:

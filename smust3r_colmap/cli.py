@@ -1,6 +1,7 @@
 """The command line: ``reconstruct``, ``demo`` and ``doctor``; the other commands are in ``*_command``.
 
-Flags, files and exit codes live here and nowhere else; so do printing and the set-up of logging.
+Flags, files of settings, exit codes and printing live here and there and nowhere else; so does, here, the set-up of
+logging.
 Settings come from the defaults, then the TOML file, then the flags. What a command needs is
 imported when the command runs, so that ``--help`` answers at once.
 

@@ -7,6 +7,7 @@ stage sees its settings; the functions below it take plain arguments.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -26,14 +27,17 @@ RobustKernel = Literal["cauchy", "tukey", "huber"]
 TrackSource = Literal["features", "pointmaps", "both"]
 MeshMethod = Literal["none", "poisson", "tsdf"]
 
+_LARGEST = 2**31 - 1
+"""Whole numbers end there in COLMAP."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImportConfig:
     """Reading the image folder."""
 
     camera_mode: CameraMode = "auto"
-    """Which images share intrinsics: auto is one camera per folder, size and camera model of the EXIF;
-    single is one for all; per-folder and per-image as named."""
+    """Which images share intrinsics: auto is one camera per folder, size, and camera model and focal length of the
+    EXIF; single is one for all; per-folder and per-image as named."""
     camera_model: str = "SIMPLE_RADIAL"
     """COLMAP model of cameras that come without calibration; COLMAP's own default, one distortion term."""
     camera_params: str = ""
@@ -79,6 +83,18 @@ class ClassicalConfig:
     depth_planes: int = 64
     """Depth hypotheses per pixel at most, uniform in inverse depth; fewer where steps of one pixel suffice."""
 
+    def __post_init__(self) -> None:
+        # 32 pixels is the smallest image that is read, 12 planes the least that are smoothed.
+        _check_at_least(
+            self,
+            max_image_size=32,
+            max_features=1,
+            match_neighbours=1,
+            exhaustive_below=0,
+            dense_size=32,
+            depth_planes=12,
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class Must3rConfig:
@@ -119,12 +135,8 @@ class Must3rConfig:
     def __post_init__(self) -> None:
         if self.network_size < 32 or self.network_size % 16:
             raise ConfigError(f"--network-size {self.network_size}: a multiple of 16, 32 or more")
-        for name, least in (("max_keyframes", 1), ("keyframe_interval", 1), ("refinements", 0)):
-            if getattr(self, name) < least:
-                raise ConfigError(f"--{name.replace('_', '-')} {getattr(self, name)}: must be at least {least}")
-        for name in ("keyframe_threshold", "network_memory", "token_cache"):
-            if getattr(self, name) < 0:
-                raise ConfigError(f"--{name.replace('_', '-')} {getattr(self, name)}: must not be negative")
+        _check_at_least(self, max_keyframes=1, keyframe_interval=1, refinements=0)
+        _check_at_least(self, keyframe_threshold=0, network_memory=0, token_cache=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,6 +157,10 @@ class AlignmentConfig:
     """cauchy and tukey take their scale from the residuals; huber is the paper's, with a fixed delta."""
     huber_delta: float = 0.1
     """Where the paper's Huber loss turns linear, in segment units; only for the huber kernel."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.huber_delta < math.inf:
+            raise ConfigError(f"--huber-delta {self.huber_delta}: must be above 0, and finite")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,9 +186,7 @@ class LoopConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.loop_similarity < 1:
             raise ConfigError(f"--loop-similarity {self.loop_similarity}: a cosine from 0 (automatic) to below 1")
-        for name in ("loop_min_candidates", "loop_min_distance", "loop_half_width"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"--{name.replace('_', '-')} {getattr(self, name)}: must be at least 1")
+        _check_at_least(self, loop_min_candidates=1, loop_min_distance=1, loop_half_width=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,6 +197,9 @@ class FusionConfig:
     """Upper bound of the fused cloud of each model; what a laptop viewer and a splat trainer digest."""
     min_confidence: float = 2.0
     """Pixels below are left out; 1 is no confidence, each view that agrees adds up to one."""
+
+    def __post_init__(self) -> None:
+        _check_at_least(self, max_points=1, min_confidence=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,8 +219,7 @@ class RefinementConfig:
     """Let COLMAP's incremental mapper try the images that got no pose, on the adjusted model."""
 
     def __post_init__(self) -> None:
-        if self.track_neighbours < 1:
-            raise ConfigError(f"--track-neighbours {self.track_neighbours}: must be at least 1")
+        _check_at_least(self, track_neighbours=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -268,3 +284,13 @@ class RunConfig:
     def __post_init__(self) -> None:
         if self.workers < 0:
             raise ConfigError(f"--workers {self.workers}: give 0 (all cores) or a positive number")
+        _check_at_least(self, seed=0)
+
+
+def _check_at_least(settings: object, **least: int) -> None:
+    """Refuse settings that are below their least value, no number, or more than COLMAP can hold."""
+    for name, lowest in least.items():
+        value = getattr(settings, name)
+        if not lowest <= value <= _LARGEST:
+            bound = f"at most {_LARGEST}" if value > _LARGEST else f"at least {lowest}"
+            raise ConfigError(f"--{name.replace('_', '-')} {value}: must be {bound}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
@@ -120,8 +121,7 @@ def _checked(path: Path, key: str, value: object, slots: Mapping[str, _Slot]) ->
     if isinstance(value, dict):
         raise ConfigError(f"{path}: [{key}] is a table; settings stand at the top level, without tables")
     if key not in slots:
-        near = difflib.get_close_matches(key, slots, n=3) or sorted(slots)
-        raise ConfigError(f"{path}: unknown setting {key!r}; known are {', '.join(near)}")
+        raise ConfigError(f"{path}: unknown setting {key!r}; {_way_out(key, value, slots)}")
     wanted = slots[key].type
     if get_origin(wanted) is Literal:
         if value not in get_args(wanted):
@@ -133,6 +133,16 @@ def _checked(path: Path, key: str, value: object, slots: Mapping[str, _Slot]) ->
         raise ConfigError(f"{path}: {key} = {value!r} is a {type(value).__name__}; needed is a {wanted.__name__}")
     assert isinstance(value, Setting)
     return value
+
+
+def _way_out(key: str, value: object, slots: Mapping[str, _Slot]) -> str:
+    """What an unknown key may stand for: the flag that switches a setting off, or a slip of the fingers."""
+    negated = re.fullmatch(r"no[_-](.+)", key)
+    switches = [name for name, slot in slots.items() if slot.type is bool]
+    if negated and (switch := difflib.get_close_matches(negated[1], switches, n=1, cutoff=0.8)):
+        return f"did you mean {switch[0]} = {_toml_value(value is False)}?"
+    near = difflib.get_close_matches(key, slots, n=3) or sorted(slots)
+    return f"known are {', '.join(near)}"
 
 
 def _toml_value(value: Setting) -> str:

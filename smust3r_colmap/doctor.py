@@ -41,7 +41,11 @@ _NOT_NEEDED = frozenset({"open3d", "torch"})
 
 _PARTS = (
     ("importer", "image folder", "smust3r_colmap.importers.image_folder"),
+    ("importer", "COLMAP model", "smust3r_colmap.importers.colmap_model"),
     ("exporter", "COLMAP model", "smust3r_colmap.exporters.colmap_sparse"),
+    ("exporter", "COLMAP database", "smust3r_colmap.exporters.colmap_database"),
+    ("exporter", "dense workspace", "smust3r_colmap.exporters.dense_workspace"),
+    ("exporter", "trainer folder", "smust3r_colmap.exporters.trainer_folder"),
     ("exporter", "PLY cloud", "smust3r_colmap.exporters.ply"),
     ("exporter", "GLB scene", "smust3r_colmap.exporters.glb"),
     ("exporter", "TUM trajectory", "smust3r_colmap.exporters.tum_trajectory"),

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import tyro
 
@@ -38,7 +38,7 @@ class Export:
     """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """Output folder of a finished reconstruct or refine."""
+    """Output folder of a finished reconstruct or refine; `--format list` needs none."""
     format: tuple[FormatName, ...]
     """What to write; several names are several formats."""
     output: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
@@ -73,10 +73,16 @@ def run_export(command: Export, reporter: Reporter) -> int:
     from smust3r_colmap.finished_run import check_is_finished, open_finished  # noqa: PLC0415
     from smust3r_colmap.run_directory import RunDirectory  # noqa: PLC0415
 
-    if _LIST in command.format:
+    taken_for_run = _format_taken_for_run(command)
+    if _LIST in (*command.format, taken_for_run):
         width = max(map(len, FORMATS))
         print("\n".join(f"{name:{width}}  {one.about}" for name, one in FORMATS.items()))
         return _EXIT_GOOD
+    if taken_for_run:
+        raise ConfigError(
+            f"RUN is missing: {taken_for_run!r} is a format and no folder; "
+            f"name the run first, as in `export RUN --format {' '.join((*command.format, taken_for_run))}`"
+        )
     settings = _settings(command)
     names = [name for name in FORMATS if name in command.format]
     check_is_finished(command.run)
@@ -92,6 +98,12 @@ def run_export(command: Export, reporter: Reporter) -> int:
                 for remark in written.remarks:
                     print(f"  {remark}")
     return _EXIT_GOOD
+
+
+def _format_taken_for_run(command: Export) -> str:
+    """The last name after ``--format``, which the parser takes for RUN where there is no other; or nothing."""
+    name = str(command.run)
+    return name if name in get_args(FormatName) and not command.run.is_dir() else ""
 
 
 def _settings(command: Export) -> FormatSettings:

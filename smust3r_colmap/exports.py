@@ -149,6 +149,7 @@ def write_database(finished: FinishedRun, settings: FormatSettings) -> Written:
     target = finished.output / DATABASE_FILE
     aside = target.with_name(f".{DATABASE_FILE}.partial")
     with storage_errors(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(finished.database, aside)
         aside.replace(target)
     return Written(name=DATABASE_FILE)

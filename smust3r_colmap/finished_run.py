@@ -90,11 +90,13 @@ def check_is_finished(root: Path) -> None:
         InputError: there is no such folder, or no finished run in it.
     """
     if not root.is_dir():
-        raise InputError(f"{root}: there is no such folder; give the output folder of reconstruct")
+        raise InputError(f"{root}: there is no such folder; give the output folder of reconstruct or refine")
     if not (root / "work" / "lock").is_file():
         raise InputError(f"{root}: is no run of this program, for it has no work folder of one")
     if not (root / "work" / FINISHED_FILE).is_file():
-        raise InputError(f"{root}: the run is not finished; start the same reconstruct command again, it goes on")
+        raise InputError(
+            f"{root}: the run is not finished; start the reconstruct or refine that made it again, it goes on"
+        )
 
 
 def open_finished(run: RunDirectory, *, images: Path | None = None, output: Path | None = None) -> FinishedRun:

@@ -65,7 +65,7 @@ class ListWeights(WeightsAction):
 class FetchWeights(WeightsAction):
     """Fetch an official file into the cache after consent to its licence; goes on after an interruption."""
 
-    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")] = RECOMMENDED
+    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[NAME]")] = RECOMMENDED
     """Official name, as `weights list` prints it."""
     accept_licence: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """You have read the licence and accept it; for scripts, which cannot be asked."""
@@ -77,7 +77,9 @@ class FetchWeights(WeightsAction):
 class VerifyWeights(WeightsAction):
     """Compare files with the published sums; exit code 1 if one is not as published."""
 
-    file: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FILE|NAME")] = ""
+    file: Annotated[
+        tyro.conf.Positional[str], tyro.conf.arg(metavar="[FILE|NAME]", help_behavior_hint="(optional)")
+    ] = ""
     """A file, or an official name in the cache; without it, all official files in the cache."""
 
 
@@ -87,7 +89,10 @@ class ConvertWeights(WeightsAction):
 
     source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")]
     """A checkpoint (.pth), or an official name in the cache."""
-    target: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="TARGET.safetensors")] = None
+    target: Annotated[
+        tyro.conf.Positional[Path | None],
+        tyro.conf.arg(metavar="[TARGET.safetensors]", help_behavior_hint="(optional)"),
+    ] = None
     """By default beside the source, under its name; in the cache it is then taken by itself."""
 
 
@@ -95,7 +100,7 @@ class ConvertWeights(WeightsAction):
 class PathOfWeights(WeightsAction):
     """Print the file that `reconstruct --backbone must3r` would take; exit code 1 if there is none."""
 
-    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")] = ""
+    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[NAME]", help_behavior_hint="(optional)")] = ""
     """An official name: where that file lies in the cache."""
     network_size: int = Must3rConfig.network_size
     """Of the run; up to 224 it takes another network."""

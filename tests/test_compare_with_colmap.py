@@ -368,6 +368,7 @@ def finished(tmp_path: Path) -> Path:
     (work / "ours" / "summary.json").write_text(json.dumps({"stages": stages}))
     record = json.dumps(vars(cost(20.0, 15.0)))
     (work / "ours.json").write_text(record)
+    (work / "ours.settings").write_text("--segment-length 60 --overlap 20")
     for mapper in ("incremental", "global"):
         write_model(work / "colmap" / mapper / "0", disturbed(0.02))
     for stage in ("features", "matching", "incremental", "global"):
@@ -379,7 +380,7 @@ def run_script(folder: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> di
     """The results by method; the working folder is that of ``finished``."""
     monkeypatch.chdir(folder)
     arguments = compare.parse_arguments(["walk", "--output", "work", *words])
-    opened = compare.open_dataset("walk", arguments.output, all_images=False)
+    opened = compare.open_dataset("walk", arguments.output, all_images=arguments.all_images)
     return {result.method: result for result in compare.run_methods(opened, arguments)}
 
 
@@ -436,6 +437,61 @@ def test_ours_is_run_again_beside_what_colmap_left(finished: Path, monkeypatch: 
     assert len(commands) == 2
     run_script(finished, monkeypatch, "--reuse", "--rerun-ours")
     assert Path(commands[2][commands[2].index("--output") + 1]).name == "ours"
+
+
+@pytest.mark.parametrize(
+    "words", [["--flags=--no-dense"], ["--segment-length", "12"], ["--overlap", "3"], ["--workers", "1"]]
+)
+def test_a_run_with_other_settings_is_not_reused_under_their_name(
+    words: list[str], finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    work = finished / "work" / "walk"
+    for end in ("json", "settings"):
+        (work / f"ours_workers1.{end}").write_text((work / f"ours.{end}").read_text())
+    monkeypatch.setattr(compare, "run_child", never)
+    with pytest.raises(SystemExit, match=r"made with --segment-length 60 --overlap 20, and asked for .*--rerun-ours"):
+        run_script(finished, monkeypatch, "--reuse", *words)
+
+
+def test_a_run_that_does_not_tell_its_settings_is_not_reused(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (finished / "work" / "walk" / "ours.settings").unlink()
+    monkeypatch.setattr(compare, "run_child", never)
+    with pytest.raises(SystemExit, match=r"ours\.json: was made with settings that it does not tell.*--rerun-ours"):
+        run_script(finished, monkeypatch, "--reuse")
+
+
+def test_a_run_that_was_broken_off_leaves_no_record_of_the_one_before(
+    finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def break_off(*_: object) -> Cost:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(compare, "run_child", break_off)
+    with pytest.raises(KeyboardInterrupt):
+        run_script(finished, monkeypatch, "--reuse", "--rerun-ours")
+    assert not (finished / "work" / "walk" / "ours.json").exists()
+
+
+def test_all_images_lie_apart_from_the_subset_and_only_where_there_is_one(
+    finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outputs: list[Path] = []
+
+    def record(command: list[str], log: Path) -> Cost:
+        outputs.append(Path(command[command.index("--output") + 1] if "--output" in command else command[4]))
+        return cost()
+
+    monkeypatch.setattr(compare, "run_child", record)
+    words = ["--all-images", "--skip-global"]
+    run_script(finished, monkeypatch, *words)
+    assert {path.parent for path in outputs} == {Path("work/walk")}
+    outputs.clear()
+    (finished / "walk" / compare.SUBSET_FILE).write_text("\n".join(NAMES[::5]))
+    run_script(finished, monkeypatch, *words)
+    assert {path.parent for path in outputs} == {Path("work/walk_all")}
+    outputs.clear()
+    run_script(finished, monkeypatch, "--skip-global")
+    assert {path.parent for path in outputs} == {Path("work/walk")}
 
 
 def test_rerunning_ours_alone_needs_reuse(capsys: pytest.CaptureFixture[str]) -> None:

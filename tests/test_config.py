@@ -1,11 +1,26 @@
 """The settings, as values and as a TOML file."""
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from smust3r_colmap.config import AlignmentConfig, ImportConfig, OutputConfig, RunConfig, SegmentationConfig
+from smust3r_colmap import cli
+from smust3r_colmap.backbones.classical.plane_sweep import MIN_PLANES
+from smust3r_colmap.config import (
+    AlignmentConfig,
+    ClassicalConfig,
+    FusionConfig,
+    ImportConfig,
+    LoopConfig,
+    Must3rConfig,
+    OutputConfig,
+    RefinementConfig,
+    RunConfig,
+    SegmentationConfig,
+)
 from smust3r_colmap.config_file import config_from_toml, config_to_toml, flags_from_settings, read_settings
 from smust3r_colmap.errors import ConfigError
 
@@ -48,6 +63,11 @@ def test_whole_numbers_are_taken_for_real_ones(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("segment_lenght = 5", "unknown setting 'segment_lenght'; known are segment_length"),
+        ("no_loops = true", r"unknown setting 'no_loops'; did you mean loops = false\?"),
+        ("no-trainer = false", r"did you mean trainer = true\?"),
+        ("no_lops = true", r"did you mean loops = false\?"),
+        ("no_mesh = true", "unknown setting 'no_mesh'; known are .*mesh"),
+        ("no_dense_size = 5", "unknown setting 'no_dense_size'; known are dense_size"),
         ("zzzz = 5", "unknown setting 'zzzz'; known are .*overlap.*seed"),
         ("[segmentation]\noverlap = 5", "segmentation. is a table"),
         ("overlap = 1.5", "overlap = 1.5 is a float; needed is a int"),
@@ -105,3 +125,70 @@ def test_tightest_windows_are_accepted() -> None:
 def test_negative_workers_are_refused() -> None:
     with pytest.raises(ConfigError, match="--workers -1"):
         RunConfig(workers=-1)
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "least"),
+    [
+        (ClassicalConfig, "max_image_size", 32),
+        (ClassicalConfig, "max_features", 1),
+        (ClassicalConfig, "match_neighbours", 1),
+        (ClassicalConfig, "exhaustive_below", 0),
+        (ClassicalConfig, "dense_size", 32),
+        (ClassicalConfig, "depth_planes", MIN_PLANES),
+        (Must3rConfig, "max_keyframes", 1),
+        (Must3rConfig, "keyframe_interval", 1),
+        (Must3rConfig, "refinements", 0),
+        (LoopConfig, "loop_min_candidates", 1),
+        (LoopConfig, "loop_min_distance", 1),
+        (LoopConfig, "loop_half_width", 1),
+        (FusionConfig, "max_points", 1),
+        (RefinementConfig, "track_neighbours", 1),
+        (RunConfig, "seed", 0),
+    ],
+)
+def test_whole_numbers_end_where_they_make_no_sense(group: Callable[..., object], name: str, least: int) -> None:
+    largest = 2**31 - 1
+    flag = f"--{name.replace('_', '-')}"
+    for good in (least, largest):
+        assert getattr(group(**{name: good}), name) == good
+    for bad in (least - 1, -5):
+        with pytest.raises(ConfigError, match=f"^{flag} {bad}: must be at least {least}$"):
+            group(**{name: bad})
+    with pytest.raises(ConfigError, match=f"^{flag} {largest + 1}: must be at most {largest}$"):
+        group(**{name: largest + 1})
+
+
+@pytest.mark.parametrize(
+    ("group", "name"),
+    [
+        (Must3rConfig, "keyframe_threshold"),
+        (Must3rConfig, "network_memory"),
+        (Must3rConfig, "token_cache"),
+        (FusionConfig, "min_confidence"),
+    ],
+)
+def test_real_numbers_are_finite_and_not_negative(group: Callable[..., object], name: str) -> None:
+    assert getattr(group(**{name: 0.0}), name) == 0.0
+    for bad in (-0.1, math.inf, math.nan):
+        with pytest.raises(ConfigError, match=f"^--{name.replace('_', '-')} {bad}: must be at"):
+            group(**{name: bad})
+
+
+@pytest.mark.parametrize("bad", [0.0, -0.1, math.inf, math.nan])
+def test_hubers_delta_is_positive_and_finite(bad: float) -> None:
+    with pytest.raises(ConfigError, match=f"^--huber-delta {bad}: must be above 0, and finite$"):
+        AlignmentConfig(huber_delta=bad)
+
+
+def test_every_number_among_the_settings_refuses_nonsense() -> None:
+    """What a new setting needs, too: minus a thousand is good for none of them."""
+    for name in numbers_among_the_settings():
+        with pytest.raises(ConfigError, match=f"--{name.replace('_', '-')} -1000"):
+            cli.parse(["reconstruct", "in", "--output", "out", f"--{name.replace('_', '-')}=-1000"])
+
+
+def numbers_among_the_settings() -> list[str]:
+    """The keys whose default is a number."""
+    table = (line.split(" = ") for line in config_to_toml(RunConfig()).splitlines() if " = " in line)
+    return [key for key, value in table if value.replace(".", "").isdecimal()]

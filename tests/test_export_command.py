@@ -114,6 +114,20 @@ def test_every_format_is_listed_with_a_line(run: Path, capsys: pytest.CaptureFix
     assert all(len(line.split()) > 3 for line in lines)
 
 
+@pytest.mark.parametrize("arguments", [("--format", "list"), ("--format=list",), ("--format", "ply", "list")])
+def test_formats_are_listed_without_a_run(arguments: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    assert export(*arguments) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(FORMATS)
+
+
+def test_a_run_that_is_missing_is_said_to_be_and_one_behind_the_formats_is_found(run: Path) -> None:
+    for names in (["ply"], ["sparse", "ply"]):
+        with pytest.raises(ConfigError, match=f"RUN is missing: 'ply' .* `export RUN --format {' '.join(names)}`"):
+            export("--format", *names)
+    assert export("--format", "ply", run) == 0
+    assert export("--format", "ply", run.rename(run.with_name("sparse"))) == 0
+
+
 def test_help_names_every_format(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         export("--help")
@@ -134,6 +148,12 @@ def test_another_folder_gets_the_result_and_the_run_stays(run: Path, tmp_path: P
     assert content(tmp_path / "else/where") == {
         name: data for name, data in before.items() if name.split("/")[0] in ("sparse", "database.db")
     }
+
+
+@pytest.mark.parametrize("name", ["sparse", "database", "ply", "glb", "tum"])
+def test_every_format_makes_the_folder_that_is_not_there(name: str, run: Path, tmp_path: Path) -> None:
+    assert export(run, "--format", name, "--output", tmp_path / "else/where") == 0
+    assert [path.name for path in (tmp_path / "else/where").iterdir()] == [FORMATS[name].result]
 
 
 def test_results_of_others_are_not_replaced(run: Path, tmp_path: Path) -> None:
@@ -202,7 +222,7 @@ def test_images_that_changed_are_refused_before_anything_is_written(
 
 
 def test_a_folder_that_is_no_finished_run_is_refused_and_left_alone(run: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="nowhere: there is no such folder"):
+    with pytest.raises(InputError, match=r"nowhere: there is no such folder; give .* of reconstruct or refine"):
         export(tmp_path / "nowhere", "--format", "ply")
     assert not (tmp_path / "nowhere").exists()
     (tmp_path / "photos").mkdir()
@@ -210,7 +230,7 @@ def test_a_folder_that_is_no_finished_run_is_refused_and_left_alone(run: Path, t
         export(tmp_path / "photos", "--format", "ply")
     assert not any((tmp_path / "photos").iterdir())
     (run / "work/finished.json").unlink()
-    with pytest.raises(InputError, match="the run is not finished; start the same reconstruct command again"):
+    with pytest.raises(InputError, match="not finished; start the reconstruct or refine that made it again"):
         export(run, "--format", "ply")
 
 

@@ -53,7 +53,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Room:
     for k, pose in enumerate(world_from_cam):
         rgb, one = scene.render(pose, CAMERA)
         Image.fromarray(rgb).save(images / f"{k}.png")
-        depth.append(one)
+        depth.append(one.astype(np.float64))
     stitched = disturbed(invert_rigid(world_from_cam), np.random.default_rng(0), position=0.01, rotation_deg=0.3)
     return Room(images=images, world_from_cam=world_from_cam, stitched=stitched, depth=tuple(depth))
 

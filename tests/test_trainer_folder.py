@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -505,6 +505,9 @@ def test_an_older_folder_is_replaced_and_a_foreign_one_is_not(tmp_path: Path) ->
     second = write(tmp_path, plane_model(names=("3.png", "4.png", "5.png")))
     assert len(list((second.folder / "images").iterdir())) == 3
     assert not (second.folder / "images_4_png").exists()
+    for scales in ((100, 120), (2,)):  # as small as the images allow
+        write(tmp_path, plane_model(), scales=scales)
+    assert not list(second.folder.glob("*_100"))
     (second.folder / "my_splat.ply").touch()
     with pytest.raises(RunDirectoryError, match=r"'my_splat\.ply', which is not ours to replace"):
         write(tmp_path, plane_model())
@@ -539,4 +542,33 @@ def test_no_name_ends_another() -> None:
     """Brush takes the first file whose path ends with the name."""
     found = flat_names({f"{k}.jpg": ".jpg" for k in (1, 2, 11)})
     assert list(found.values()) == ["1_1.jpg", "2_2.jpg", "3_11.jpg"]
-    assert not any(a != b and a.endswith(b) for a in found.values() for b in found.values())
+    assert not clashes(found.values())
+
+
+def clashes(names: Iterable[str]) -> list[tuple[str, str]]:
+    """Names that end another, compared as Brush does."""
+    lower = [name.lower() for name in names]
+    return [(short, long) for short in lower for long in lower if short != long and long.endswith(short)]
+
+
+@pytest.mark.parametrize(
+    ("olds", "news"),
+    [
+        (["a.jpg", "1_a.jpg"], ["1_a.jpg", "2_1-a.jpg"]),
+        (["1_1.jpg", "1.jpg", "2_1_1.jpg"], ["1_1-1.jpg", "2_1.jpg", "3_2-1-1.jpg"]),
+        (["01_a.jpg", "1_a.jpg", "b_c.jpg"], ["1_01-a.jpg", "2_1-a.jpg", "3_b_c.jpg"]),
+    ],
+)
+def test_numbers_in_front_of_numbers_end_no_name_either(olds: list[str], news: list[str]) -> None:
+    found = list(flat_names(dict.fromkeys(olds, ".jpg")).values())
+    assert found == news
+    assert not clashes(found)
+
+
+def test_names_of_every_sort_come_out_different_and_clean() -> None:
+    rng = np.random.default_rng(7)
+    for _ in range(500):
+        stems = {"".join(rng.choice(list("12aA_-/"), size=rng.integers(1, 6))).strip("/") for _ in range(15)}
+        found = flat_names({f"{stem}.x": str(rng.choice([".jpg", ".png"])) for stem in sorted(stems)})
+        assert len({PurePosixPath(name).stem.lower() for name in found.values()}) == len(found)
+        assert not clashes(found.values())

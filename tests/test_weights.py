@@ -855,6 +855,27 @@ def test_convert_refuses_what_it_cannot_read_or_would_overwrite(
     assert Path("here.safetensors").read_bytes() == b"weights"
 
 
+@pytest.mark.parametrize(
+    ("command", "usage", "closing"),
+    [
+        ("fetch", "[NAME]", f"(default: {NAME})"),
+        ("verify", "[FILE|NAME]", "(optional)"),
+        ("convert", "SOURCE [TARGET.safetensors]", "(optional)"),
+        ("path", "[NAME]", "(optional)"),
+    ],
+)
+def test_help_tells_what_may_be_left_out(
+    command: str, usage: str, closing: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["weights", command, "--help"])
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert f"weights {command} [-h] {usage} [--quiet]" in said
+    assert closing in said
+    assert "(default: '')" not in said
+    assert "(default: None)" not in said
+
+
 def test_help_of_weights_needs_no_network_code() -> None:
     program = """
 import contextlib, sys
