@@ -137,6 +137,22 @@ def test_a_file_cut_short_ends_with_one_and_everything_else_is_still_looked_at(
     assert {reader["verdict"] for reader in result["readers"]} == {"refuses"}
 
 
+def test_text_that_cannot_be_read_ends_with_one_and_says_only_that(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("cameras.txt", "images.txt"):
+        (tmp_path / name).write_text("garbage\n")
+    code, result = run_json(capsys, str(tmp_path))
+    run(str(tmp_path))
+    text = capsys.readouterr().out
+
+    assert (code, result["readable"]) == (1, False)
+    assert [finding["rule"] for finding in result["findings"]] == ["file-unreadable", "text-bad-line"]
+    assert "0 readable images, 0 readable cameras, 0 readable points\n" in text
+    assert "cameras.txt, images.txt" in text
+    assert "Do: copy or write the model again; is it a model of COLMAP at all? [file-unreadable]" in text
+
+
 def test_no_model_ends_with_one_and_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(str(tmp_path)) == 1
     assert "no COLMAP model here" in capsys.readouterr().err

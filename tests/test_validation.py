@@ -18,11 +18,12 @@ import pytest
 from PIL import Image
 
 from smust3r_colmap.errors import ConfigError, InputError, StorageError
+from smust3r_colmap.importers.colmap_records import Repairs, read_records
 from smust3r_colmap.validation.description import CAMERA_MODELS, Defect, FloatArray, ImageFile, Rig, Subject
 from smust3r_colmap.validation.layout import UnreadableModelError, find_layout
 from smust3r_colmap.validation.projection import index_of, project
 from smust3r_colmap.validation.readers import READERS, find_readers
-from smust3r_colmap.validation.report import judge, verdicts
+from smust3r_colmap.validation.report import EXIT_REFUSED, EXIT_UNREADABLE, judge, verdicts
 from smust3r_colmap.validation.rules import RULES, Severity, apply_rules
 from smust3r_colmap.validation.surroundings import (
     read_database,
@@ -554,6 +555,7 @@ FROM_BARE: dict[str, Case] = {
     "model-without-number": (lambda bare: with_model(bare, folder=Path("scene/sparse")), set()),
     "model-not-largest": (lambda bare: replace(bare, siblings={"0": 6, "1": 7}), {"model-one-of-several"}),
     "model-one-of-several": (lambda bare: replace(bare, siblings={"0": 6, "1": 2}), set()),
+    "file-unreadable": (lambda bare: with_model(bare, unread=("cameras.txt",)), {"-camera-model-PINHOLE"}),
     "colmap-cannot-read": (lambda bare: replace(bare, unread_by_colmap="IndexError: at"), set()),
     **{
         name: (with_defect(name), set[str]())
@@ -984,6 +986,104 @@ def test_a_line_that_cannot_be_read_is_named_and_the_rest_is_kept(
     assert len(read.points) == 9
 
 
+HUGE = 2**63 + 1
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("file", "line", "text"),
+    [
+        ("cameras.txt", f"{HUGE} PINHOLE 640 480 500 500 320 240", "its id is not from 0 to 4294967294"),
+        ("cameras.txt", "4294967295 PINHOLE 640 480 500 500 320 240", "its id is not from 0 to 4294967294"),
+        ("cameras.txt", "-1 PINHOLE 640 480 500 500 320 240", "its id is not from 0 to 4294967294"),
+        ("cameras.txt", f"9 PINHOLE {2**64} 480 500 500 320 240", "its size has more than 64 bits"),
+        ("cameras.txt", f"9 PINHOLE 640 {10**30} 500 500 320 240", "its size has more than 64 bits"),
+        ("images.txt", f"{HUGE} 1 0 0 0 0 0 0 1 a.png\n1 2 -1", "an id that is not from 0 to 4294967294"),
+        ("images.txt", f"9 1 0 0 0 0 0 0 {10**30} a.png\n", "an id that is not from 0 to 4294967294"),
+        ("images.txt", "4294967295 1 0 0 0 0 0 0 1 a.png\n1 2 -1", "an id that is not from 0 to 4294967294"),
+        ("points3D.txt", f"{2**64} 0 0 0 1 1 1 1", "id (below 2^64)"),
+        ("points3D.txt", f"{2**64 - 1} 0 0 0 1 1 1 1", "id (below 2^64)"),
+        ("points3D.txt", "nan 0 0 0 1 1 1 1", "id (below 2^64)"),
+        ("points3D.txt", "1e300 0 0 0 1 1 1 1", "id (below 2^64)"),
+        ("points3D.txt", "-1 0 0 0 1 1 1 1", "id (below 2^64)"),
+        ("points3D.txt", "99 0 0 0 1 1 1 1 nan 0", "track in pairs (below 2^32)"),
+        ("points3D.txt", f"99 0 0 0 1 1 1 1 1 {HUGE}", "track in pairs (below 2^32)"),
+        ("points3D.txt", "99 0 0 0 1 1 1 1 4294967295 0", "track in pairs (below 2^32)"),
+    ],
+)
+def test_a_line_with_a_number_that_is_no_id_is_named_and_the_rest_is_kept(
+    model: pycolmap.Reconstruction, tmp_path: Path, file: str, line: str, text: str
+) -> None:
+    before = read_model(tmp_path / "txt")
+    edit_lines(tmp_path / "txt" / file, lambda lines: [line, *lines])
+    subject = describe(find_layout(tmp_path / "txt", images=None, database=None), ask_colmap=False)
+    evidence = apply_rules(subject, RULES.values())["text-bad-line"]
+
+    assert evidence.count == 1
+    assert evidence.text.startswith(f"{file}, line {5 if file == 'images.txt' else 4}: ")
+    assert text in evidence.text
+    assert subject.model.cameras == before.cameras
+    assert subject.model.images.names == before.images.names
+    np.testing.assert_array_equal(subject.model.images.point_ids, before.images.point_ids)
+    assert subject.model.points is not None
+    assert len(subject.model.points) == 9
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("point_id", ["nan", "1.5", "-2", "1e300", str(2**64)])
+def test_an_observation_of_a_point_that_is_no_id_is_named(
+    model: pycolmap.Reconstruction, tmp_path: Path, point_id: str
+) -> None:
+    edit_lines(tmp_path / "txt" / "images.txt", lambda lines: [lines[0], f"{lines[1]} 1 2 {point_id}", *lines[2:]])
+    read = read_model(tmp_path / "txt")
+
+    assert [(defect.rule, defect.where) for defect in read.defects] == [("text-bad-line", "images.txt, line 6")]
+    assert read.images.num_rows[0] == 0
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_largest_ids_and_sizes_that_colmap_has_are_read_to_the_last_digit(
+    model: pycolmap.Reconstruction, tmp_path: Path
+) -> None:
+    """Above 2^63 as from binary files, where the ids of points are read with a sign."""
+    folder = tmp_path / "txt"
+    edit_lines(folder / "cameras.txt", lambda _: [f"{2**32 - 2} PINHOLE {2**64 - 1} 480 500 500 320 240"])
+    edit_lines(
+        folder / "images.txt",
+        lambda _: [f"{2**32 - 2} 1 0 0 0 0 0 0 {2**32 - 2} a.png", f"1 2 {2**64 - 2} 3 4 {2**64 - 3} 5 6 -1"],
+    )
+    points = [f"{2**64 - 2 - index} 0 0 1 1 1 1 1 {2**32 - 2} {index}" for index in range(2)]
+    edit_lines(folder / "points3D.txt", lambda _: points)
+    (folder / "rigs.txt").unlink()
+    (folder / "frames.txt").unlink()
+    subject = describe(find_layout(folder, images=None, database=None), ask_colmap=False)
+    found = found_in(subject)
+
+    assert subject.model.defects == ()
+    assert subject.model.points is not None
+    assert subject.model.points.ids.tolist() == [-2, -3]
+    assert subject.model.images.point_ids.tolist() == [-2, -3, -1]
+    assert {"id-too-large", "point-id-huge"} <= found
+    assert not {"id-duplicate", "observation-dangling", "track-dangling", "track-disagrees"} & found
+
+
+@pytest.mark.filterwarnings("error")
+def test_nasty_words_in_text_end_in_findings_and_not_in_errors(model: pycolmap.Reconstruction, tmp_path: Path) -> None:
+    rng = random.Random(0)
+    nasty = ("nan", "-inf", "-1", "0", "1e300", str(2**32 - 1), str(HUGE), str(2**64 - 1), "9" * 5000, "1.5", "x", "")
+    for path in sorted((tmp_path / "txt").glob("*.txt")) * 30:
+        whole = path.read_text()
+        words = whole.split(" ")
+        for _ in range(3):
+            words[rng.randrange(len(words))] = rng.choice(nasty)
+        path.write_text(" ".join(words))
+        with np.errstate(all="ignore"):  # places as far away as 1e300
+            read = read_model(tmp_path / "txt")
+            found = apply_rules(Subject(model=read, projection=project(read)), RULES.values())
+        assert all(evidence.text for evidence in found.values())
+        path.write_text(whole)
+
+
 def test_a_bad_line_of_observations_costs_that_image_its_observations(
     model: pycolmap.Reconstruction, tmp_path: Path
 ) -> None:
@@ -1045,6 +1145,61 @@ def test_two_forms_of_one_model_must_agree(model: pycolmap.Reconstruction, tmp_p
     assert (agreeing.form, agreeing.defects) == ("binary", ())
     assert fewer.text == "9 points in .bin, 8 in .txt"
     assert "is in one form only (8 images in .bin, 7 in .txt)" in missing.text
+
+
+def test_lines_that_cannot_be_read_are_told_instead_of_a_difference_to_the_other_form(
+    model: pycolmap.Reconstruction, tmp_path: Path
+) -> None:
+    for path in (tmp_path / "bin").iterdir():
+        path.rename(tmp_path / "txt" / path.name)
+    (tmp_path / "txt" / "images.txt").write_text("no images\n")
+    bad_text = read_model(tmp_path / "txt")
+    (tmp_path / "txt" / "images.bin").write_bytes(b"no images")
+    bad_both = read_model(tmp_path / "txt")
+
+    assert [(defect.rule, defect.where) for defect in bad_text.defects] == [("text-bad-line", "images.txt, line 1")]
+    assert (bad_text.unread, bad_both.unread) == ((), ("images.bin",))
+    assert [defect.rule for defect in bad_both.defects] == ["file-truncated", "text-bad-line"]
+
+
+@pytest.mark.parametrize("form", ["txt", "bin"])
+@pytest.mark.parametrize("part", ["cameras", "images", "points3D"])
+def test_a_file_in_which_nothing_can_be_read_has_no_other_findings_than_that(
+    model: pycolmap.Reconstruction, tmp_path: Path, part: str, form: str
+) -> None:
+    (tmp_path / form / f"{part}.{form}").write_text("garbage is no model\nand never was\n")
+    report = validate(tmp_path / form, ask_colmap=True)
+    noted = "text-bad-line" if form == "txt" else "file-truncated"
+
+    assert report.exit_code == EXIT_UNREADABLE
+    assert [finding.rule.name for finding in report.findings] == ["file-unreadable", noted]
+    assert report.findings[0].evidence.text == f"{part}.{form}"
+    assert report.findings[1].evidence.text.startswith(f"{part}.{form}, ")
+
+
+def test_a_model_with_nothing_in_it_can_be_read(tmp_path: Path) -> None:
+    for part in ("cameras", "images", "points3D"):
+        (tmp_path / f"{part}.txt").write_text("# nothing\n")
+    report = validate(tmp_path, ask_colmap=False)
+
+    assert report.exit_code == EXIT_REFUSED
+    assert {"images-none", "points-none"} <= {finding.rule.name for finding in report.findings}
+    assert "camera-id-not-one" not in {finding.rule.name for finding in report.findings}
+    assert "text, 0 images, 0 cameras, 0 points" in report.render_text()
+
+
+def test_refine_is_advised_for_lost_lines_of_observations_and_reads_them(
+    model: pycolmap.Reconstruction, tmp_path: Path
+) -> None:
+    edit_lines(tmp_path / "txt" / "images.txt", lambda lines: lines[::2])
+    report = validate(tmp_path / "txt", ask_colmap=False)
+    (line,) = [line for line in report.render_text().splitlines() if "[text-observations-missing]" in line]
+    repairs = Repairs()
+
+    assert "Do: `smust3r-colmap refine MODEL --images DIR`" in line
+    assert "Nobody can use it" not in line
+    assert len(read_records(tmp_path / "txt", repairs).images) == len(model.images)
+    assert "8 images without a line of observations" in repairs.texts()[0]
 
 
 # ---------------------------------------------------------------------------- what lies beside
@@ -1310,6 +1465,14 @@ def test_paths_that_were_given_must_exist(scene: Path, tmp_path: Path) -> None:
         find_layout(scene, images=tmp_path / "nothing", database=None)
     with pytest.raises(InputError, match=r"--database .*: no such file"):
         find_layout(scene, images=None, database=tmp_path / "nothing.db")
+
+
+def test_a_file_in_the_place_of_a_folder_is_called_a_file(scene: Path) -> None:
+    cameras = scene / "sparse" / "0" / "cameras.bin"
+    with pytest.raises(InputError, match=r"cameras.bin: is a file; give the folder of the model"):
+        find_layout(cameras, images=None, database=None)
+    with pytest.raises(InputError, match=r"--images .*cameras.bin: is a file; give the folder that holds the images"):
+        find_layout(scene, images=cameras, database=None)
 
 
 def test_a_file_that_cannot_be_opened_is_named(

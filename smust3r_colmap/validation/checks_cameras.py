@@ -103,7 +103,7 @@ def _per_image(subject: Subject) -> Evidence | None:
 )
 def _id_not_one(subject: Subject) -> Evidence | None:
     ids = sorted(camera.camera_id for camera in subject.model.cameras)
-    return None if ids == [1] else measured(f"{len(ids)} cameras, ids {_shown(ids)}")
+    return None if ids in ([], [1]) else measured(f"{len(ids)} cameras, ids {_shown(ids)}")
 
 
 def _shown(ids: list[int]) -> str:

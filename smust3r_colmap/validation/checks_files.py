@@ -3,9 +3,27 @@
 from __future__ import annotations
 
 from smust3r_colmap.validation.description import Subject
-from smust3r_colmap.validation.rules import Evidence, Severity, defects_as_evidence, measured, offenders, rule
+from smust3r_colmap.validation.rules import (
+    UNREAD_RULE,
+    Evidence,
+    Severity,
+    defects_as_evidence,
+    measured,
+    offenders,
+    rule,
+)
 
 _SHOWN_MESSAGE = 200
+
+
+@rule(
+    UNREAD_RULE,
+    "nothing in a file can be read, so the rest was not checked",
+    severity=Severity.BROKEN,
+    advice="copy or write the model again; is it a model of COLMAP at all?",
+)
+def _unreadable(subject: Subject) -> Evidence | None:
+    return measured(", ".join(subject.model.unread)) if subject.model.unread else None
 
 
 @rule(
@@ -87,7 +105,8 @@ def _bad_line(subject: Subject) -> Evidence | None:
     "text-observations-missing",
     "images.txt lacks lines of observations, so lines no longer come in pairs",
     severity=Severity.REFUSED,
-    advice="every image needs two lines; the second is empty where it has no observations",
+    advice="`smust3r-colmap refine MODEL --images DIR` reads it all the same and writes a whole model; or give every "
+    "image a second line, which is empty where it has no observations",
 )
 def _odd_lines(subject: Subject) -> Evidence | None:
     return defects_as_evidence(subject, "text-observations-missing")

@@ -242,6 +242,7 @@ class ModelDescription:
         rigs, frames: None where the file is missing, as in models from before COLMAP 3.12.
         points: None where the file is missing.
         defects: what the parser stumbled over.
+        unread: files of cameras, images or points that hold something, of which not one record can be read.
     """
 
     folder: Path
@@ -252,6 +253,7 @@ class ModelDescription:
     rigs: tuple[Rig, ...] | None
     frames: tuple[Frame, ...] | None
     defects: tuple[Defect, ...]
+    unread: tuple[str, ...] = ()
 
     @cached_property
     def camera_by_id(self) -> Mapping[int, Camera]:

@@ -68,13 +68,16 @@ def find_layout(named: Path, *, images: Path | None, database: Path | None) -> L
         images, database: where they are given they are taken; else they are looked for.
 
     Raises:
-        InputError: a path that was given does not exist.
+        InputError: a path that was given does not exist, or is a file where a folder is needed.
         UnreadableModelError: there is no model, or the files of cameras or images are missing.
     """
+    if named.exists() and not named.is_dir():
+        raise InputError(f"{named}: is a file; give the folder of the model")
     if not named.is_dir():
         raise InputError(f"{named}: no such folder; name the folder of a COLMAP model")
     if images is not None and not images.is_dir():
-        raise InputError(f"--images {images}: no such folder")
+        what = "is a file; give the folder that holds the images" if images.exists() else "no such folder"
+        raise InputError(f"--images {images}: {what}")
     if database is not None and not database.is_file():
         raise InputError(f"--database {database}: no such file")
     model = _find_model(named)

@@ -98,9 +98,10 @@ class Report:
     def render_text(self, *, width: int | None = None) -> str:
         """For people; every finding is one line, or wrapped at ``width`` letters."""
         findings = [_finding_text(finding, width) for finding in self.findings]
+        which = "readable " if self.exit_code == EXIT_UNREADABLE else ""
         return "\n".join(
             [
-                f"{self.model}: {_figures_text(self.figures)}",
+                f"{self.model}: {_figures_text(self.figures, which)}",
                 *(f"  {kind}: {place}" for kind, place in self.beside.items()),
                 "",
                 *(findings or ["Nothing to remark."]),
@@ -171,11 +172,13 @@ def _mean(values: np.ndarray[Any, Any]) -> float:
     return float(values.mean()) if len(values) else float("nan")
 
 
-def _figures_text(figures: Figures) -> str:
+def _figures_text(figures: Figures, which: str) -> str:
+    """``which`` is put before the things that are counted; it is empty, or ends with a blank."""
     cameras = ", ".join(figures.cameras[:_NAMES_SHOWN]) + (", ..." if len(figures.cameras) > _NAMES_SHOWN else "")
     text = (
-        f"{figures.form}, {_counted(figures.num_images, 'image')}, {_counted(figures.num_cameras, 'camera')} "
-        f"({cameras}), {_counted(figures.num_points, 'point')}"
+        f"{figures.form}, {_counted(figures.num_images, f'{which}image')}, "
+        f"{_counted(figures.num_cameras, f'{which}camera')}{cameras and f' ({cameras})'}, "
+        f"{_counted(figures.num_points, f'{which}point')}"
     )
     if figures.num_observations:
         text += (
@@ -194,12 +197,12 @@ def _counted(number: int, unit: str) -> str:
 def _finding_text(finding: Finding, width: int | None) -> str:
     parts = [f"{finding.rule.title}: {finding.evidence.text}."]
     if finding.rule.severity >= Severity.REFUSED:
-        parts.append("Nobody can use it so.")
+        parts.append("No reader can use it so.")
     if finding.refused_by:
         parts.append(f"Refused by {_who(finding.refused_by)}.")
     if finding.warned_by:
         parts.append(f"Worse in {_who(finding.warned_by)}.")
-    parts.append(f"Do: {finding.rule.advice}. [{finding.rule.name}]")
+    parts.append(f"Do: {finding.rule.advice}{'' if finding.rule.advice.endswith('?') else '.'} [{finding.rule.name}]")
     head = f"{finding.severity.name.lower():{_SEVERITY_WIDTH}} "
     line = head + " ".join(parts)
     if width is None:

@@ -82,6 +82,10 @@ RULES: dict[str, Rule] = {}
 """By name, in the order in which they are reported; ``validate`` imports the modules that fill it."""
 
 
+UNREAD_RULE = "file-unreadable"
+"""Of a model with a file in which nothing can be read; most other rules would say that again in other words."""
+
+
 def rule(name: str, title: str, *, severity: Severity, advice: str) -> Callable[[Check], Check]:
     """Register the decorated function as the check of a new rule."""
 
@@ -130,6 +134,12 @@ class Finding:
 
 
 def apply_rules(subject: Subject, rules: Iterable[Rule]) -> dict[str, Evidence]:
-    """What each rule found, by its name; those that found nothing are left out."""
+    """What each rule found, by its name; those that found nothing are left out.
+
+    Where nothing in a file can be read, only ``UNREAD_RULE`` is asked, and the rules that parsers noted defects for.
+    """
+    if subject.model.unread:
+        asked = {UNREAD_RULE, *(defect.rule for defect in subject.model.defects)}
+        rules = [rule for rule in rules if rule.name in asked]
     found = {rule.name: rule.check(subject) for rule in rules}
     return {name: evidence for name, evidence in found.items() if evidence is not None}

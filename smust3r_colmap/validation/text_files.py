@@ -19,11 +19,13 @@ import numpy as np
 from smust3r_colmap.validation.description import (
     CAMERA_MODELS,
     NO_POINT,
+    BoolArray,
     Camera,
     Defect,
     FloatArray,
     Frame,
     Images,
+    IntArray,
     Points,
     Rig,
 )
@@ -33,6 +35,17 @@ RecordT = TypeVar("RecordT")
 _SENSOR_KINDS = {"CAMERA": 0, "IMU": 1}
 _POINT_HEAD = 8
 """Numbers before the track of a point: id, xyz, rgb, error."""
+
+_NO_ID = 2**32 - 1
+"""COLMAP's "none"; ids of cameras and images, and places in a list of observations, are below."""
+
+_IS_NO_ID = f"is not from 0 to {_NO_ID - 1}"
+_IS_NO_POINT = "is no point: id (below 2^64), x, y, z, r, g, b, error, track in pairs (below 2^32)"
+
+_SIZE_LIMIT = 2**64
+_POINT_ID_LIMIT = 2**64
+_EXACT_LIMIT = 2**53
+"""Whole numbers below are exact as floats."""
 
 _SHOWN_LETTERS = 60
 _NO_NUMBERS = np.empty(0)
@@ -44,6 +57,25 @@ class _ImageLine:
     pose: tuple[float, ...]
     camera_id: int
     name: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ObservationLine:
+    """``xy_img`` is (M, 2), ``point_ids`` is (M,)."""
+
+    xy_img: FloatArray
+    point_ids: IntArray
+
+
+_NO_OBSERVATIONS = _ObservationLine(xy_img=np.empty((0, 2)), point_ids=np.empty(0, np.int64))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _PointLine:
+    """``numbers`` are all of the line; the first is the id, as near as a float comes to it."""
+
+    point_id: int
+    numbers: FloatArray
 
 
 def read_cameras(path: Path) -> tuple[tuple[Camera, ...], list[Defect]]:
@@ -68,11 +100,11 @@ def read_images(path: Path) -> tuple[Images, list[Defect]]:
     """All images whose lines can be read, and what is wrong with the file.
 
     An image line that is followed by another image line has lost its line of observations; it is read
-    as an image without any.
+    as an image without any. The observations of an image with an id that is none are left out with it.
     """
     lines = _lines(path)
     heads: list[_ImageLine] = []
-    observations: list[FloatArray] = []
+    observations: list[_ObservationLine] = []
     defects: list[Defect] = []
     at = 0
     while at < len(lines):
@@ -84,27 +116,33 @@ def read_images(path: Path) -> tuple[Images, list[Defect]]:
         if head is None:
             defects.append(_bad_line(path, at, line, "is neither an image nor the observations of one"))
             continue
-        heads.append(head)
         following = lines[at] if at < len(lines) else None
-        if following is None or _image_line(following) is not None:
+        if following is not None and _image_line(following) is not None:
+            following = None
+        if not (_is_id(head.image_id) and _is_id(head.camera_id)):
+            defects.append(_bad_line(path, at, line, f"is an image with an id that {_IS_NO_ID}"))
+            at += following is not None
+            continue
+        heads.append(head)
+        if following is None:
             text = f"image {head.name!r} is not followed by its line of observations"
             defects.append(Defect(rule="text-observations-missing", where=f"{path.name}, line {at}", text=text))
-            observations.append(_NO_NUMBERS)
+            observations.append(_NO_OBSERVATIONS)
             continue
         at += 1
-        numbers = _numbers(following)
-        if numbers is None or len(numbers) % 3:
-            defects.append(_bad_line(path, at, following, "is no list of x, y, point id"))
-            numbers = _NO_NUMBERS
-        observations.append(numbers)
+        observed = _observation_line(following)
+        if observed is None:
+            defects.append(_bad_line(path, at, following, "is no list of x, y, point id (-1, or below 2^64)"))
+            observed = _NO_OBSERVATIONS
+        observations.append(observed)
         if at == len(lines) and not following.strip():
             text = f"the last line, the observations of {head.name!r}, is empty"
             defects.append(Defect(rule="text-last-line-empty", where=f"{path.name}, line {at}", text=text))
     return _images(heads, observations), defects
 
 
-def _images(heads: list[_ImageLine], observations: list[FloatArray]) -> Images:
-    rows = np.concatenate([_NO_NUMBERS, *observations]).reshape(-1, 3)
+def _images(heads: list[_ImageLine], observations: list[_ObservationLine]) -> Images:
+    everything = [_NO_OBSERVATIONS, *observations]
     poses = np.array([head.pose for head in heads], np.float64).reshape(-1, 7)
     return Images(
         ids=np.array([head.image_id for head in heads], np.int64),
@@ -112,10 +150,9 @@ def _images(heads: list[_ImageLine], observations: list[FloatArray]) -> Images:
         names=tuple(head.name for head in heads),
         quat_wxyz=poses[:, :4],
         translation=poses[:, 4:],
-        starts=np.cumsum([0, *(len(numbers) // 3 for numbers in observations)], dtype=np.int64),
-        xy_img=rows[:, :2].copy(),
-        # Some programs write COLMAP's "no point" as the largest unsigned number instead of -1.
-        point_ids=np.where((rows[:, 2] >= 0) & (rows[:, 2] < 2.0**63), rows[:, 2], NO_POINT).astype(np.int64),
+        starts=np.cumsum([0, *(len(observed.point_ids) for observed in observations)], dtype=np.int64),
+        xy_img=np.concatenate([observed.xy_img for observed in everything]),
+        point_ids=np.concatenate([observed.point_ids for observed in everything]),
     )
 
 
@@ -138,38 +175,98 @@ def _image_line(line: str) -> _ImageLine | None:
         return None
 
 
+def _observation_line(line: str) -> _ObservationLine | None:
+    """None for a line that is something else than threes of x, y and a point's id."""
+    numbers = _numbers(line)
+    if numbers is None or len(numbers) % 3:
+        return None
+    point_ids = _point_ids(line, numbers, slice(2, None, 3))
+    return None if point_ids is None else _ObservationLine(xy_img=numbers.reshape(-1, 3)[:, :2], point_ids=point_ids)
+
+
+def _point_ids(line: str, numbers: FloatArray, places: slice) -> IntArray | None:
+    """The ids at these places of a line with these numbers; None where one of them is no id.
+
+    ``NO_POINT`` is written as -1, by some programs as the largest number of 64 bits. As from binary files,
+    ids of 2^63 and more come out negative.
+    """
+    rounded = numbers[places]
+    if _are_whole(rounded, least=NO_POINT, limit=_EXACT_LIMIT):
+        return rounded.astype(np.int64)
+    try:
+        exact = [int(word) for word in line.split()[places]]
+    except ValueError:
+        return None
+    if not all(NO_POINT <= point_id < _POINT_ID_LIMIT for point_id in exact):
+        return None
+    return np.array([point_id % _POINT_ID_LIMIT for point_id in exact], np.uint64).view(np.int64)
+
+
+def _are_whole(numbers: FloatArray, *, least: int = 0, limit: int) -> bool:
+    """All are whole numbers from ``least`` to below ``limit``."""
+    return bool(((numbers >= least) & (numbers < limit) & (numbers == np.floor(numbers))).all())
+
+
 def read_points(path: Path) -> tuple[Points, list[Defect]]:
     """All points whose lines can be read, and what is wrong with the file."""
     numbered = [
         (number, line) for number, line in enumerate(_lines(path), 1) if line.strip() and not line.startswith("#")
     ]
-    defects: list[Defect] = []
     counts = np.array([line.strip().count(" ") + 1 for _, line in numbered], np.int64)
     flat = _numbers(" ".join(line for _, line in numbered))
-    if flat is None or len(flat) != counts.sum() or (counts < _POINT_HEAD).any() or (counts % 2).any():
-        rows = []
-        for number, line in numbered:
-            row = _numbers(line)
-            if row is None or len(row) < _POINT_HEAD or len(row) % 2:
-                defects.append(
-                    _bad_line(path, number, line, "is no point: id, x, y, z, r, g, b, error, track in pairs")
-                )
-            else:
-                rows.append(row)
-        counts = np.array([len(row) for row in rows], np.int64)
-        flat = np.concatenate([_NO_NUMBERS, *rows])
-    return _points(flat, counts), defects
+    if flat is not None and len(flat) == counts.sum() and _are_points(flat, counts):
+        return _points(flat[_heads(counts)[:, 0]].astype(np.int64), flat, counts), []
+    rows: list[_PointLine] = []
+    defects: list[Defect] = []
+    for number, line in numbered:
+        row = _point_line(line)
+        if row is None:
+            defects.append(_bad_line(path, number, line, _IS_NO_POINT))
+        else:
+            rows.append(row)
+    point_ids = np.array([row.point_id for row in rows], np.int64)
+    counts = np.array([len(row.numbers) for row in rows], np.int64)
+    return _points(point_ids, np.concatenate([_NO_NUMBERS, *(row.numbers for row in rows)]), counts), defects
 
 
-def _points(flat: FloatArray, counts: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Points:
-    """From the numbers of all lines, one after the other, and how many each line has."""
+def _are_points(flat: FloatArray, counts: IntArray) -> bool:
+    """Each of the lines is a point, with an id that a float holds exactly; arguments as for ``_points``."""
+    if (counts < _POINT_HEAD).any() or (counts % 2).any():
+        return False
+    ids, tracks = flat[_heads(counts)[:, 0]], flat[_in_track(counts)]
+    return _are_whole(ids, limit=_EXACT_LIMIT) and _are_whole(tracks, limit=_NO_ID)
+
+
+def _point_line(line: str) -> _PointLine | None:
+    """None for a line that is no point."""
+    numbers = _numbers(line)
+    if numbers is None or len(numbers) < _POINT_HEAD or len(numbers) % 2:
+        return None
+    point_ids = _point_ids(line, numbers, slice(1))
+    if point_ids is None or point_ids[0] == NO_POINT or not _are_whole(numbers[_POINT_HEAD:], limit=_NO_ID):
+        return None
+    return _PointLine(point_id=int(point_ids[0]), numbers=numbers)
+
+
+def _heads(counts: IntArray) -> IntArray:
+    """(P, 8) places of the numbers before each track, where each of P lines has so many numbers."""
     first = np.concatenate([[0], np.cumsum(counts)])[:-1].astype(np.int64)
-    heads = flat[first[:, None] + np.arange(_POINT_HEAD)]
-    in_track = np.ones(len(flat), np.bool_)
-    in_track[(first[:, None] + np.arange(_POINT_HEAD)).ravel()] = False
-    elements = flat[in_track].reshape(-1, 2).astype(np.int64)
+    return np.asarray(first[:, None] + np.arange(_POINT_HEAD), np.int64)
+
+
+def _in_track(counts: IntArray) -> BoolArray:
+    """Which numbers of all lines are elements of tracks."""
+    in_track = np.ones(counts.sum(), np.bool_)
+    in_track[_heads(counts).ravel()] = False
+    return in_track
+
+
+def _points(point_ids: IntArray, flat: FloatArray, counts: IntArray) -> Points:
+    """From the numbers of all lines, one after the other, and how many each line has."""
+    heads = flat[_heads(counts)]
+    elements = flat[_in_track(counts)].reshape(-1, 2).astype(np.int64)
     return Points(
-        ids=heads[:, 0].astype(np.int64),
+        ids=point_ids,
         xyz=heads[:, 1:4].copy(),
         rgb=np.clip(np.nan_to_num(heads[:, 4:7]), 0, 255).astype(np.uint8),
         starts=np.concatenate([[0], np.cumsum((counts - _POINT_HEAD) // 2)]).astype(np.int64),
@@ -200,7 +297,16 @@ def _camera(fields: list[str]) -> Camera:
     known = CAMERA_MODELS.get(model)
     if known is not None and len(params) != known.num_params:
         raise ValueError(f"{model} has {known.num_params} parameters, not {len(params)}")
-    return Camera(camera_id=int(fields[0]), model=model, width=int(fields[2]), height=int(fields[3]), params=params)
+    camera_id, width, height = int(fields[0]), int(fields[2]), int(fields[3])
+    if not _is_id(camera_id):
+        raise ValueError(f"its id {_IS_NO_ID}")
+    if max(width, height) >= _SIZE_LIMIT:
+        raise ValueError("its size has more than 64 bits")
+    return Camera(camera_id=camera_id, model=model, width=width, height=height, params=params)
+
+
+def _is_id(number: int) -> bool:
+    return 0 <= number < _NO_ID
 
 
 def _rig(fields: list[str]) -> Rig:

@@ -49,6 +49,8 @@ _CHECKS = (
 """The modules of the rules, which register themselves when they are imported; a new one is added here."""
 
 _POSE_TOLERANCE = 1e-6
+_UNREAD = frozenset({"file-truncated", "text-bad-line"})
+"""Rules of defects that keep records of a file from being read."""
 
 
 def validate(
@@ -68,7 +70,7 @@ def validate(
         ask_colmap: also let pycolmap read the model, in a child process.
 
     Raises:
-        InputError: a path that was given does not exist.
+        InputError: a path that was given does not exist, or is a file where a folder is needed.
         UnreadableModelError: there is no model, or the files of cameras or images are missing.
         StorageError: a file of the model cannot be opened.
     """
@@ -104,7 +106,7 @@ def describe(layout: Layout, *, ask_colmap: bool) -> Subject:
         dense=read_dense(layout.scene),
         transforms=None if layout.transforms is None else read_transforms(layout.transforms),
         siblings={name: _num_images(folder) for name, folder in layout.numbered.items()},
-        unread_by_colmap=_ask_colmap(layout.model) if ask_colmap else "",
+        unread_by_colmap=_ask_colmap(layout.model) if ask_colmap and not model.unread else "",
     )
 
 
@@ -125,7 +127,7 @@ def read_model(folder: Path) -> ModelDescription:
         model = _read_form(folder, "binary")
         if not needed <= text.keys():
             return model
-        return replace(model, defects=(*model.defects, *_differences(model, _read_form(folder, "text"))))
+        return replace(model, defects=(*model.defects, *_second_form_defects(model, _read_form(folder, "text"))))
     except OSError as error:
         raise StorageError(f"{error.filename}: cannot be read ({error.strerror})") from error
 
@@ -139,6 +141,11 @@ def _read_form(folder: Path, form: Literal["binary", "text"]) -> ModelDescriptio
     points, point_defects = parser.read_points(files["points3D"]) if "points3D" in files else (None, [])
     rigs, rig_defects = parser.read_rigs(files["rigs"]) if "rigs" in files else (None, [])
     frames, frame_defects = parser.read_frames(files["frames"]) if "frames" in files else (None, [])
+    parts = (
+        ("cameras", cameras, camera_defects),
+        ("images", images, image_defects),
+        ("points3D", points, point_defects),
+    )
     return ModelDescription(
         folder=folder,
         form=form,
@@ -148,7 +155,19 @@ def _read_form(folder: Path, form: Literal["binary", "text"]) -> ModelDescriptio
         rigs=rigs,
         frames=frames,
         defects=(*camera_defects, *image_defects, *point_defects, *rig_defects, *frame_defects),
+        unread=tuple(files[part].name for part, records, defects in parts if not records and _any_unread(defects)),
     )
+
+
+def _any_unread(defects: Iterable[Defect]) -> bool:
+    return any(defect.rule in _UNREAD for defect in defects)
+
+
+def _second_form_defects(binary: ModelDescription, text: ModelDescription) -> list[Defect]:
+    """Lines of the text that cannot be read; where both forms are whole, in what they differ."""
+    if _any_unread((*binary.defects, *text.defects)):
+        return [defect for defect in text.defects if defect.rule in _UNREAD]
+    return _differences(binary, text)
 
 
 def _differences(binary: ModelDescription, text: ModelDescription) -> list[Defect]:
