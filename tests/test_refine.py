@@ -43,6 +43,7 @@ from tracked_scenes import (
 from smust3r_colmap.config import RefinementConfig, RunConfig
 from smust3r_colmap.errors import ConfigError
 from smust3r_colmap.execution import TaskResult
+from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import FloatArray, ImageCollection, PointCloud, RunFeatures, Scene
 from smust3r_colmap.progress import QuietReporter, Stage
 from smust3r_colmap.refinement import adjustment, refine, task
@@ -108,9 +109,10 @@ def refined(
     scenes: Sequence[Iterable[int]] | None = None,
     calibrated: bool = False,
     parts: tuple[tuple[int, ...], ...] = (),
+    camera: Intrinsics = CAMERA,
 ) -> Refined:
     """Of true matches between neighbours."""
-    collection = make_collection(folder, len(world), calibrated=calibrated)
+    collection = make_collection(folder, len(world), calibrated=calibrated, cameras=(camera,))
     pairs = pairs_within(range(len(world)), REACH)
     write_features(folder / "features.db", collection, world, verified={p: true_matches(world, p) for p in pairs})
     groups = [range(len(world))] if scenes is None else scenes
@@ -358,6 +360,59 @@ def test_focal_length_and_distortion_are_found(walk: Refined) -> None:
     assert np.hypot(x - 320, y - 240) < 12
 
 
+@pytest.mark.parametrize(
+    ("model", "start", "truth"),
+    [
+        ("PINHOLE", (540.0, 575.0, 320.0, 240.0), (560.0, 555.0, 320.0, 240.0)),
+        (
+            "OPENCV",
+            (575.0, 575.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0),
+            (560.0, 555.0, 320.0, 240.0, -0.08, 0.02, 0.0, 0.0),
+        ),
+        (
+            "OPENCV_FISHEYE",
+            (350.0, 350.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0),
+            (340.0, 338.0, 320.0, 240.0, 0.02, 0.0, 0.0, 0.0),
+        ),
+    ],
+)
+def test_cameras_of_other_models_are_found(
+    model: str, start: tuple[float, ...], truth: tuple[float, ...], tmp_path: Path
+) -> None:
+    true_camera = Intrinsics(model=model, width=640, height=480, params=truth)
+    rng = np.random.default_rng(7)
+    world = make_world(arc(12), 2.2 * ball(250, rng), rng, camera=true_camera)  # into the corners
+    stitched = disturbed(world.cam_from_world, rng, position=0.004 * world.extent, rotation_deg=0.3)
+    result = refined(tmp_path, world, stitched, camera=replace(true_camera, params=start))
+    camera = result.model().camera(1)
+    assert camera.model.name == model
+    where_points_are = np.array([(220.0, 170.0), (420.0, 170.0), (320.0, 330.0)])
+    found, at_first, true_rays = (
+        one.rays_cam(where_points_are)
+        for one in (Intrinsics.from_colmap(camera), replace(true_camera, params=start), true_camera)
+    )
+    assert np.abs(found - true_rays).max() < np.abs(at_first - true_rays).max() / 2
+    _, aligned = fitted(centres_of(np.stack(list(poses_of(result.model()).values()))), world.centres)
+    assert rms(aligned, world.centres) < rms(centres_of(stitched), world.centres) / 3
+
+
+def test_distortion_that_runs_away_is_held_and_everything_else_adjusted(tmp_path: Path) -> None:
+    """Near the middle of a fisheye image its four terms make up for each other."""
+    params = (350.0, 350.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0)
+    camera = Intrinsics(model="OPENCV_FISHEYE", width=640, height=480, params=params)
+    rng = np.random.default_rng(7)
+    world = make_world(arc(12), ball(250, rng), rng, camera=camera)
+    stitched = disturbed(world.cam_from_world, rng, position=0.004 * world.extent, rotation_deg=0.3)
+    result = refined(tmp_path, world, stitched, camera=camera)
+    steps = [(step.name, step.kept) for step in result.figures[0].steps]
+    k = steps.index(("adjustment", False))
+    assert "distortion of camera 1 went beyond" in result.figures[0].steps[k].reason
+    assert steps[k + 1] == ("adjustment with cameras held", True)
+    assert tuple(result.model().camera(1).params) == params
+    _, aligned = fitted(centres_of(np.stack(list(poses_of(result.model()).values()))), world.centres)
+    assert rms(aligned, world.centres) < rms(centres_of(stitched), world.centres) / 3
+
+
 # ----------------------------------------------------------------------- the frame stays
 def test_scale_and_frame_stay_because_of_the_priors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stitched centres that a best fit finds exactly in the true frame: 0.2 % with priors, drift without."""
@@ -531,7 +586,8 @@ def test_adjustments_that_diverge_are_undone_and_reported(tmp_path: Path, monkey
     result = refined(tmp_path, world, stitched)
     (figures,) = result.figures
     undone = [step for step in figures.steps if "adjustment" in step.name]
-    assert len(undone) >= 3
+    assert len(undone) >= 6
+    assert [step.name for step in undone[:2]] == ["adjustment", "adjustment with cameras held"]
     assert not any(step.kept for step in undone)
     assert all("focal length of camera 1 went to 3 times" in step.reason for step in undone)
     assert f"no adjustment stood: {undone[-1].reason}" in figures.doubts

@@ -232,7 +232,7 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
         return _nothing_to_adjust(bench, priors, steps)
     if len(scene) > LARGE:
         steps.append(tried_step("adjustment of parts", bench.model, lambda: _adjust_parts(bench.model, task)))
-    steps.append(_adjustment("adjustment", bench.model, priors, task, FIRST_ITERATIONS, rough=True))
+    steps += _adjustment("adjustment", bench.model, priors, task, FIRST_ITERATIONS, rough=True)
     bench.filter(FIRST_FILTER_PX)
 
     tight = Tolerance(pixels=max(TIGHT_PART * _longer_side(task), MIN_TIGHT_PX), angle_deg=TIGHT_ANGLE_DEG)
@@ -240,7 +240,7 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
     registered = bench.register_missing(features, tight)
     steps.append(_triangulation(bench, tight, name="longer tracks"))
     bench.drop_needless_pairs()
-    steps.append(_adjustment("second adjustment", bench.model, priors, task, SECOND_ITERATIONS, rough=True))
+    steps += _adjustment("second adjustment", bench.model, priors, task, SECOND_ITERATIONS, rough=True)
     bench.filter(MAX_ERROR_PX)
     replacement = place_bent_images_again(bench, features, tight)
     if replacement.report:
@@ -249,23 +249,23 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
         # Where they were says nothing any more: not for the adjustment, and not where they turn out weak.
         bench, stitched = replacement.bench, {**stitched, **replacement.cam_from_world}
         priors = priors.with_places(replacement.cam_from_world)
-        steps.append(_adjustment("adjustment around them", bench.model, priors, task, SECOND_ITERATIONS, rough=True))
+        steps += _adjustment("adjustment around them", bench.model, priors, task, SECOND_ITERATIONS, rough=True)
         bench.filter(MAX_ERROR_PX)
     why_not = _why_principal_points_stay(bench.model, priors, task)
     if not why_not:
         moved = _adjustment(
             "principal point", bench.model, priors, task, SECOND_ITERATIONS, principal_point=True, rough=True
         )
-        steps.append(moved)
-        why_not = moved.reason
+        steps += moved
+        why_not = moved[0].reason
         bench.filter(MAX_ERROR_PX)
     free = not why_not
     principal_point = f"{STAYED}: {why_not}" if why_not else "free: two halves of the points agree on it and fit better"
     for _ in range(MAX_LAST_ROUNDS):
         bench.complete(tight)
         bench.drop_needless_pairs()
-        last = _adjustment("last adjustment", bench.model, priors, task, LAST_ITERATIONS, principal_point=free)
-        steps.append(last)
+        steps += _adjustment("last adjustment", bench.model, priors, task, LAST_ITERATIONS, principal_point=free)
+        last = steps[-1]
         bench.filter(min(MAX_ERROR_PX, tight.pixels))
         if last.max_moved_percent < STILL_PERCENT or not last.kept:
             break
@@ -287,21 +287,28 @@ def _adjustment(
     *,
     principal_point: bool = False,
     rough: bool = False,
-) -> StepReport:
-    """All cameras and points; ``rough``ly, and of a large model on a part of the points, where another follows."""
+) -> list[StepReport]:
+    """All cameras and points; ``rough``ly, and of a large model on a part of the points, where another follows.
 
-    def step() -> bool:
+    What a camera's parameters have spoilt is tried once more with these held: the distortion of a fisheye model
+    runs away where all points are near the middle of the images, and poses and points want adjusting all the same.
+    """
+
+    def step(*, held: bool) -> bool:
         return (adjust_on_part if rough and model.num_reg_images() > LARGE else adjust)(
             model,
             priors,
-            calibrated=task.calibrated,
+            calibrated=held,
             max_iterations=max_iterations,
             threads=task.threads,
             principal_point=principal_point,
             function_tolerance=ROUGH_TOLERANCE if rough else FUNCTION_TOLERANCE,
         )
 
-    return tried_step(name, model, step)
+    reports = [tried_step(name, model, partial(step, held=task.calibrated))]
+    if not (reports[0].kept or task.calibrated):
+        reports.append(tried_step(f"{name} with cameras held", model, partial(step, held=True)))
+    return reports
 
 
 def _why_principal_points_stay(model: pycolmap.Reconstruction, priors: Priors, task: RefineTask) -> str:
