@@ -26,11 +26,13 @@ def walk(images: Iterable[int], reach: int = 2) -> list[Pair]:
 @pytest.mark.parametrize(
     ("num_matches", "share", "vote"),
     [
-        (STRONG_MATCHES, SOUND_SHARE, 1),
-        (8, SOUND_SHARE, 1),
+        (STRONG_MATCHES, SOUND_SHARE, 5),
+        (8, SOUND_SHARE, 2),
+        (400, SOUND_SHARE, 20),
         (STRONG_MATCHES, SOUND_SHARE - 0.01, 0),
         (STRONG_MATCHES, DENYING_SHARE, 0),
-        (STRONG_MATCHES, DENYING_SHARE - 0.01, -1),
+        (STRONG_MATCHES, DENYING_SHARE - 0.01, -5),
+        (400, 0.0, -20),
         (STRONG_MATCHES - 1, 0.0, 0),
     ],
 )
@@ -56,6 +58,13 @@ def test_one_denied_pair_does_not_make_a_bend() -> None:
 def test_look_alikes_do_not_outweigh_the_neighbours_of_an_image() -> None:
     found = votes(walk(range(12)), [(0, 11), (1, 11)])
     assert bent_images(found, range(12)) == ()
+
+
+def test_many_weak_pairs_of_a_facade_do_not_outweigh_a_few_strong_ones() -> None:
+    """As of castle_p30's three images of a corner: neighbours agree, and pairs from far across deny."""
+    facade = dict.fromkeys([(0, 9), (0, 10), (1, 10), (2, 10), (1, 9)], Agreement(num_matches=35, share=0.1))
+    found = facade | dict.fromkeys(walk(range(11)), Agreement(num_matches=400, share=0.9))
+    assert bent_images(found, range(11)) == ()
 
 
 def test_what_hangs_on_a_bent_group_is_bent_as_well() -> None:

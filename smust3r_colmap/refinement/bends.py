@@ -2,13 +2,14 @@
 
 In a sound model nearly all verified matches of near images lie on their epipolar lines; over a bend a good part
 does not. But one pair proves little: look-alike places match where nothing is wrong, and an epipolar line or two runs
-right over any bend. So pairs vote, groups of images grow together where more pairs speak for it than against, and
+right over any bend. So pairs vote, groups of images grow together where more votes are for it than against, and
 a group that the largest one contradicts is bent. The next module to read is ``replacement``.
 """
 
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
@@ -35,10 +36,14 @@ class Agreement:
 
     @property
     def vote(self) -> int:
-        """1 for the model, -1 against it; 0 from a pair that is undecided, or has too few matches to deny anything."""
+        """Above 0 for the model, below against it; 0 from a pair that is undecided, or has too few matches to deny it.
+
+        A pair's word counts as the root of its matches: those of a repeating facade, seen from far apart, are few.
+        """
+        word = math.isqrt(self.num_matches)
         if self.share >= SOUND_SHARE:
-            return 1
-        return -1 if self.share < DENYING_SHARE and self.num_matches >= STRONG_MATCHES else 0
+            return word
+        return -word if self.share < DENYING_SHARE and self.num_matches >= STRONG_MATCHES else 0
 
 
 def bent_images(agreements: Mapping[Pair, Agreement], images: Collection[int]) -> tuple[int, ...]:

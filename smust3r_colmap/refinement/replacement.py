@@ -95,6 +95,12 @@ def place_bent_images_again(bench: Bench, features: MatchedFeatures, tolerance: 
     return Replacement(bench=bench, cam_from_world=found, report=_report(bench, figures, poses, ""))
 
 
+def are_any_bent(bench: Bench, features: MatchedFeatures) -> bool:
+    """Some images of the model are bent as it stands now: what later steps adjust may straighten them."""
+    poses = poses_of(bench.model)
+    return bool(bent_images(_agreements(bench, poses, features), poses.keys()))
+
+
 def _why_no_better(
     before: Mapping[Pair, Agreement], after: Mapping[Pair, Agreement], bent: Collection[int], images: Collection[int]
 ) -> str:

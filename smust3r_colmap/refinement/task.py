@@ -66,7 +66,7 @@ from smust3r_colmap.refinement.part_adjustment import adjust_on_part
 from smust3r_colmap.refinement.pointmap_matches import MappedView, match_by_pointmaps
 from smust3r_colmap.refinement.principal_point import ask_for_principal_points
 from smust3r_colmap.refinement.replacement import NAME as REPLACEMENT
-from smust3r_colmap.refinement.replacement import place_bent_images_again
+from smust3r_colmap.refinement.replacement import are_any_bent, place_bent_images_again
 from smust3r_colmap.refinement.steps import MAX_ERROR_PX, StepReport, report_of, tried_step
 from smust3r_colmap.run_directory import StageFolder, write_json
 
@@ -269,7 +269,8 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
         bench.filter(min(MAX_ERROR_PX, tight.pixels))
         if last.max_moved_percent < STILL_PERCENT or not last.kept:
             break
-    return _finished(task, bench, priors, stitched, steps, registered, principal_point)
+    stay_bent = replacement.report is not None and are_any_bent(bench, features)
+    return _finished(task, bench, priors, stitched, steps, registered, principal_point, _doubts(steps, stay_bent))
 
 
 def _triangulation(bench: Bench, tolerance: Tolerance, *, name: str = "triangulation") -> StepReport:
@@ -352,6 +353,7 @@ def _finished(
     steps: list[StepReport],
     registered: tuple[int, ...],
     principal_point: str,
+    doubts: tuple[str, ...],
 ) -> _Outcome:
     model = bench.model
     weak = _put_back_weak_images(bench, stitched)
@@ -368,16 +370,16 @@ def _finished(
         final=figures_of(model),
         kept=some_sound,
         principal_point=principal_point,
-        doubts=_doubts(steps),
+        doubts=doubts,
         reason="" if some_sound else "no image sees enough points to be adjusted by",
     )
     return _Outcome(model=model, consent=bench.consent, priors=priors, figures=figures)
 
 
-def _doubts(steps: Sequence[StepReport]) -> tuple[str, ...]:
+def _doubts(steps: Sequence[StepReport], stay_bent: bool) -> tuple[str, ...]:
     """No adjustment stood, or images stay bent."""
     adjustments = [step for step in steps if "adjustment" in step.name]
-    doubts = [step.reason for step in steps if step.name == REPLACEMENT and not step.kept]
+    doubts = [step.reason for step in steps if step.name == REPLACEMENT and not step.kept and stay_bent]
     if adjustments and not any(step.kept for step in adjustments):
         doubts.append(f"no adjustment stood: {adjustments[-1].reason}")
     return tuple(doubts)
