@@ -1,7 +1,6 @@
 """The command line: ``reconstruct``, ``demo`` and ``doctor``; the other commands are in ``*_command``.
 
-Flags, files of settings, exit codes and printing live here and there and nowhere else; so does, here, the set-up of
-logging.
+Flags, exit codes and printing live in these modules and nowhere else; the set-up of logging lives here.
 Settings come from the defaults, then the TOML file, then the flags. What a command needs is
 imported when the command runs, so that ``--help`` answers at once.
 

@@ -292,7 +292,20 @@ def test_tracks_are_of_two_images_or_more_and_of_the_right_points(walk: Refined)
 
 
 def test_points_of_two_images_are_left_out_where_both_have_enough_others(walk: Refined) -> None:
-    model = walk.model()
+    assert_no_needless_pairs(walk.model())
+
+
+def test_points_that_the_last_filter_leaves_two_images_go_too(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    world = make_world(arc(14), ball(300, rng), rng, noise_px=1.4)
+    result = refined(
+        tmp_path, world, disturbed(world.cam_from_world, rng, position=0.004 * world.extent, rotation_deg=0.3)
+    )
+    assert result.figures[0].weak == ()
+    assert_no_needless_pairs(result.model())
+
+
+def assert_no_needless_pairs(model: pycolmap.Reconstruction) -> None:
     longer = dict.fromkeys(model.images, 0)
     pairs = []
     for point in model.points3D.values():

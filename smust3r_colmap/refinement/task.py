@@ -253,11 +253,18 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
         bench.filter(MAX_ERROR_PX)
     why_not = _why_principal_points_stay(bench.model, priors, task)
     if not why_not:
-        moved = _adjustment(
-            "principal point", bench.model, priors, task, SECOND_ITERATIONS, principal_point=True, rough=True
+        moved = _tried_adjustment(
+            "principal point",
+            bench.model,
+            priors,
+            task,
+            SECOND_ITERATIONS,
+            calibrated=False,
+            principal_point=True,
+            rough=True,
         )
-        steps += moved
-        why_not = moved[0].reason
+        steps.append(moved)
+        why_not = moved.reason
         bench.filter(MAX_ERROR_PX)
     free = not why_not
     principal_point = f"{STAYED}: {why_not}" if why_not else "free: two halves of the points agree on it and fit better"
@@ -269,8 +276,8 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
         bench.filter(min(MAX_ERROR_PX, tight.pixels))
         if last.max_moved_percent < STILL_PERCENT or not last.kept:
             break
-    stay_bent = replacement.report is not None and are_any_bent(bench, features)
-    return _finished(task, bench, priors, stitched, steps, registered, principal_point, _doubts(steps, stay_bent))
+    doubts = _doubts(steps, stay_bent=replacement.report is not None and are_any_bent(bench, features))
+    return _finished(task, bench, priors, stitched, steps, registered, principal_point, doubts)
 
 
 def _triangulation(bench: Bench, tolerance: Tolerance, *, name: str = "triangulation") -> StepReport:
@@ -289,27 +296,51 @@ def _adjustment(
     principal_point: bool = False,
     rough: bool = False,
 ) -> list[StepReport]:
-    """All cameras and points; ``rough``ly, and of a large model on a part of the points, where another follows.
+    """An adjustment, and where it is undone another with the cameras' parameters held.
 
-    What a camera's parameters have spoilt is tried once more with these held: the distortion of a fisheye model
-    runs away where all points are near the middle of the images, and poses and points want adjusting all the same.
+    The distortion of a fisheye model runs away where all points are near the middle of the images, and poses and
+    points want adjusting all the same.
     """
+    adjusted = partial(
+        _tried_adjustment,
+        model=model,
+        priors=priors,
+        task=task,
+        max_iterations=max_iterations,
+        principal_point=principal_point,
+        rough=rough,
+    )
+    first = adjusted(name, calibrated=task.calibrated)
+    if first.kept or task.calibrated:
+        return [first]
+    return [first, adjusted(f"{name} with cameras held", calibrated=True)]
 
-    def step(*, held: bool) -> bool:
+
+def _tried_adjustment(
+    name: str,
+    model: pycolmap.Reconstruction,
+    priors: Priors,
+    task: RefineTask,
+    max_iterations: int,
+    *,
+    calibrated: bool,
+    principal_point: bool,
+    rough: bool,
+) -> StepReport:
+    """All cameras and points; ``rough``ly, and of a large model on a part of the points, where another follows."""
+
+    def step() -> bool:
         return (adjust_on_part if rough and model.num_reg_images() > LARGE else adjust)(
             model,
             priors,
-            calibrated=held,
+            calibrated=calibrated,
             max_iterations=max_iterations,
             threads=task.threads,
             principal_point=principal_point,
             function_tolerance=ROUGH_TOLERANCE if rough else FUNCTION_TOLERANCE,
         )
 
-    reports = [tried_step(name, model, partial(step, held=task.calibrated))]
-    if not (reports[0].kept or task.calibrated):
-        reports.append(tried_step(f"{name} with cameras held", model, partial(step, held=True)))
-    return reports
+    return tried_step(name, model, step)
 
 
 def _why_principal_points_stay(model: pycolmap.Reconstruction, priors: Priors, task: RefineTask) -> str:
@@ -376,7 +407,7 @@ def _finished(
     return _Outcome(model=model, consent=bench.consent, priors=priors, figures=figures)
 
 
-def _doubts(steps: Sequence[StepReport], stay_bent: bool) -> tuple[str, ...]:
+def _doubts(steps: Sequence[StepReport], *, stay_bent: bool) -> tuple[str, ...]:
     """No adjustment stood, or images stay bent."""
     adjustments = [step for step in steps if "adjustment" in step.name]
     doubts = [step.reason for step in steps if step.name == REPLACEMENT and not step.kept and stay_bent]
@@ -430,14 +461,13 @@ def _put_back_weak_images(bench: Bench, stitched: Mapping[int, FloatArray]) -> l
 
     From there they do not see all that they saw, which may leave others with too little.
     """
-    weak: list[int] = []
     while True:
-        before, weak = weak, weak_images(bench.model)
-        if weak == before:
-            return weak
+        weak = weak_images(bench.model)
         _put_back(bench.model, weak, stitched)
         bench.filter(MAX_ERROR_PX)
         bench.drop_needless_pairs()
+        if weak_images(bench.model) == weak:
+            return weak
 
 
 def _put_back(model: pycolmap.Reconstruction, weak: Sequence[int], stitched: Mapping[int, FloatArray]) -> None:
