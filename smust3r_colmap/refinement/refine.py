@@ -49,7 +49,7 @@ GRID = 12
 """Cells along the longer side of an image in which its surface is sampled."""
 NEXT_IMAGES = 4
 """Neighbours in order that are matched in any case where no backbone has matched them."""
-METHOD_VERSION = 4
+METHOD_VERSION = 5
 """To be raised when the refinement changes, so that finished folders are refined again."""
 WORKERS_PER_THREAD = 2
 """Adjustment gains little from threads: on two cores a second one cost 70 % more processor time and saved none."""
