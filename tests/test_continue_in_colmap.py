@@ -1,4 +1,4 @@
-"""The page CONTINUE_IN_COLMAP.md: each of its snippets is run, on a small finished run, and does what the page says."""
+"""Each snippet of docs/continue_in_colmap.md is run, on a small finished run, and does what the page says."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tracked_scenes import angle_deg, centres_of, poses_of
 from smust3r_colmap.execution import TaskFailure, map_tasks
 from smust3r_colmap.products import FloatArray
 
-PAGE = Path(__file__).resolve().parents[1] / "CONTINUE_IN_COLMAP.md"
+PAGE = Path(__file__).resolve().parents[1] / "docs/continue_in_colmap.md"
 TAKEN_OUT = 4
 """Index of an image whose pose is taken from the model, for the page to find it again."""
 

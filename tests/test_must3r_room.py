@@ -101,8 +101,8 @@ def test_the_cloud_lies_on_the_walls(finished: tuple[Path, int], found: Evaluati
 
 
 def test_the_lines_of_the_page_run_and_give_the_cameras(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """BACKBONES.md, "MUSt3R by itself"."""
-    page = (Path(__file__).resolve().parents[1] / "BACKBONES.md").read_text(encoding="utf-8")
+    """docs/backbones.md, "MUSt3R by itself"."""
+    page = (Path(__file__).resolve().parents[1] / "docs/backbones.md").read_text(encoding="utf-8")
     section = page.partition("## MUSt3R by itself")[2]
     lines = re.search(r"```python\n(.*?)```", section, re.DOTALL)
     assert lines, "the page has no such lines"

@@ -34,7 +34,7 @@ from smust3r_colmap.products import ImageCollection
 from smust3r_colmap.progress import QuietReporter
 from smust3r_colmap.run_directory import RunDirectory
 
-PAGE = Path(__file__).resolve().parents[1] / "BACKBONES.md"
+PAGE = Path(__file__).resolve().parents[1] / "docs/backbones.md"
 EMPTY = ImageCollection(images=(), cameras=())
 
 Install = Callable[..., None]
@@ -137,7 +137,7 @@ def make(context):
         (WORKING, "makes", ConfigError, "other-net.*is broken: AttributeError: .*makes"),
         ("make = 'text'", "make", ConfigError, "is a str, needed a function or class that takes the context"),
         ("def make(context): return 3", "make", ConfigError, "gave a int without name, metric, has_tracks, describe"),
-        (WORKING.replace("has_tracks = ", ""), "make", ConfigError, "a Made without has_tracks; see BACKBONES.md"),
+        (WORKING.replace("has_tracks = ", ""), "make", ConfigError, "a Made without has_tracks; see docs/backbones.md"),
         (WORKING + "Made.reconstruct = 3", "make", ConfigError, "without reconstruct"),
     ],
 )
@@ -211,7 +211,7 @@ def test_options_that_nobody_reads_are_refused(install: Install, context: Backbo
 # ---------------------------------------------------------------------------------- the page
 def block_of_page(language: str) -> str:
     found = re.search(rf"```{language}\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    assert found, f"BACKBONES.md has no block in {language}"
+    assert found, f"docs/backbones.md has no block in {language}"
     return found[1]
 
 

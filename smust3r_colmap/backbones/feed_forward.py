@@ -2,7 +2,7 @@
 
 A feed-forward network needs two things from us: somebody who keeps its predictions, so that a run can go
 on, and somebody who turns them into pieces. It gives them as a ``Predictor``; ``FeedForwardBackbone``
-does the rest. BACKBONES.md shows a whole one.
+does the rest. docs/backbones.md shows a whole one.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Backbones by name: ours, and those that other packages register as entry points.
 
 A package adds one with an entry point in the group ``smust3r_colmap.backbones`` that names a
-``BackboneFactory``; BACKBONES.md shows how. Nothing is imported before it is asked for.
+``BackboneFactory``; docs/backbones.md shows how. Nothing is imported before it is asked for.
 """
 
 from __future__ import annotations
@@ -177,5 +177,5 @@ def _refuse_incomplete(made: object, known: KnownBackbone) -> None:
     if lacking:
         raise ConfigError(
             f"backbone {known.name} of the package {known.package}: its factory gave a {type(made).__name__} "
-            f"without {', '.join(lacking)}; see BACKBONES.md"
+            f"without {', '.join(lacking)}; see docs/backbones.md"
         )
