@@ -15,7 +15,7 @@ from pathlib import Path
 import pycolmap
 
 from smust3r_colmap.errors import InputError, StorageError
-from smust3r_colmap.exporters.aside import replaced_folder
+from smust3r_colmap.exporters.atomic_write import replaced_folder
 from smust3r_colmap.products import Scene
 
 MODEL_FILES = frozenset(

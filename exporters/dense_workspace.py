@@ -34,10 +34,10 @@ import pycolmap
 from PIL import ExifTags, Image
 
 from smust3r_colmap.errors import ImageError, InputError, ReconstructionError, StorageError
-from smust3r_colmap.execution import TaskFailure, map_tasks, usable_cores
-from smust3r_colmap.exporters.aside import replaced_folder
+from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks, usable_cores
+from smust3r_colmap.exporters.atomic_write import replaced_folder
 from smust3r_colmap.importers.images import inspect, load_rgb
-from smust3r_colmap.model_depth import ModelDepth, depth_of_model
+from smust3r_colmap.dense.depth_consistency import ModelDepth, depth_of_model
 from smust3r_colmap.products import DepthMaps, SourceImage
 
 logger = logging.getLogger(__name__)

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from smust3r_colmap.exporters.aside import replace_file
+from smust3r_colmap.exporters.atomic_write import replace_file
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import PointCloud, Scene

@@ -28,10 +28,10 @@ import trimesh
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from smust3r_colmap.doctor import advice_for
+from smust3r_colmap.cli.doctor import advice_for
 from smust3r_colmap.errors import InputError, MissingDependencyError, ReconstructionError
-from smust3r_colmap.execution import TaskFailure, map_tasks
-from smust3r_colmap.exporters.aside import replace_file
+from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks
+from smust3r_colmap.exporters.atomic_write import replace_file
 from smust3r_colmap.geometry.camera import pixel_centres
 
 FloatArray = npt.NDArray[np.float64]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.exporters.aside import replace_file
+from smust3r_colmap.exporters.atomic_write import replace_file
 from smust3r_colmap.products import PointCloud
 
 FLOAT32_RELATIVE_STEP = 1e-6

@@ -29,7 +29,7 @@ import pycolmap
 from scipy.spatial import cKDTree
 
 from smust3r_colmap.errors import InputError, StorageError
-from smust3r_colmap.exporters.aside import replaced_folder
+from smust3r_colmap.exporters.atomic_write import replaced_folder
 from smust3r_colmap.exporters.centred_pinhole import CentredPinhole
 from smust3r_colmap.exporters.flat_names import flat_names
 from smust3r_colmap.exporters.inverse_depth import common_scale, inverse_depth_values
@@ -44,7 +44,7 @@ from smust3r_colmap.exporters.trainer_images import (
 )
 from smust3r_colmap.exporters.trainer_selection import LeftOut, Selection, nearest_camera_distance, select_for_training
 from smust3r_colmap.exporters.transforms_json import points_saved, transforms_json
-from smust3r_colmap.model_depth import depth_of_model
+from smust3r_colmap.dense.depth_consistency import depth_of_model
 from smust3r_colmap.products import DepthMaps, PointCloud
 
 logger = logging.getLogger(__name__)

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from PIL import ExifTags, Image, UnidentifiedImageError
 
 from smust3r_colmap.errors import ImageError, InputError
-from smust3r_colmap.execution import usable_cores
+from smust3r_colmap.execution.task_pool import usable_cores
 from smust3r_colmap.exporters.centred_pinhole import CentredPinhole, resampled
 from smust3r_colmap.importers.images import load_rgb
 from smust3r_colmap.importers.masks import find_mask, load_mask

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.errors import InputError
-from smust3r_colmap.exporters.aside import replace_file
+from smust3r_colmap.exporters.atomic_write import replace_file
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import Scene
 

@@ -37,7 +37,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.alignment.from_pointmaps import NUM_PIXELS, align_pointmaps
-from smust3r_colmap.alignment.irls import PieceFit
+from smust3r_colmap.estimators.sim3 import PieceFit
 from smust3r_colmap.alignment.seen_points import align_seen_points
 from smust3r_colmap.config import AlignmentConfig, TransformGroup
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres

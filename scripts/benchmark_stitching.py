@@ -36,8 +36,8 @@ import numpy.typing as npt
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.sl4 import SL4
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.pose_graph.graph import PoseGraph
-from smust3r_colmap.pose_graph.optimise import GraphSolution, Kernel, optimise
+from smust3r_colmap.stitching.pose_graph.graph import PoseGraph
+from smust3r_colmap.stitching.pose_graph.optimise import GraphSolution, Kernel, optimise
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]

@@ -12,7 +12,7 @@ Every stage runs in a process of its own, so that its CPU seconds, wall time and
 own; memory is the largest resident size of one process (Linux). COLMAP gets SIFT of images of at
 most 1024 pixels with 6000 features; up to 50 images are matched exhaustively, longer sequences
 with their 10 next and quadratically spaced neighbours and some 80 spread images exhaustively.
-Accuracy is that of the largest model after a Sim(3) fit, see ``smust3r_colmap.evaluation``. Nobody
+Accuracy is that of the largest model after a Sim(3) fit, see ``smust3r_colmap.evaluation.trajectory``. Nobody
 is told the calibration: a principal point off the centre then leaves a rotation error for all.
 
 Mapping is everything after features and matching but depth maps; COLMAP's includes the start of its
@@ -52,7 +52,7 @@ from plot_trajectory import read_tum_by_name
 
 from smust3r_colmap.config import SegmentationConfig
 from smust3r_colmap.errors import DegenerateAlignmentError
-from smust3r_colmap.evaluation import (
+from smust3r_colmap.evaluation.trajectory import (
     Evaluation,
     Trajectory,
     compare_trajectories,
@@ -60,7 +60,7 @@ from smust3r_colmap.evaluation import (
     read_reference_sparse,
     read_transforms_json,
 )
-from smust3r_colmap.execution import usable_cores
+from smust3r_colmap.execution.task_pool import usable_cores
 from smust3r_colmap.importers.image_folder import natural_key
 
 DATA = Path(os.environ.get("SMUST3R_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))

@@ -17,7 +17,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from smust3r_colmap.evaluation import Evaluation, Trajectory
+from smust3r_colmap.evaluation.trajectory import Evaluation, Trajectory
 
 INCREMENTAL = "COLMAP incremental"
 GLOBAL = "COLMAP global"

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.errors import InputError
-from smust3r_colmap.evaluation import (
+from smust3r_colmap.evaluation.trajectory import (
     Trajectory,
     compare_trajectories,
     read_poses_txt,

@@ -51,7 +51,7 @@ from smust3r_colmap.backbones.must3r.encoder import Encoder
 from smust3r_colmap.backbones.must3r.head import activate
 from smust3r_colmap.backbones.must3r.preprocessing import preprocess
 from smust3r_colmap.backbones.must3r.rope import grid_positions, rope_table
-from smust3r_colmap.demo import DemoScene, demo_intrinsics
+from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
 from smust3r_colmap.geometry.camera import pixel_centres
 
 FloatArray = npt.NDArray[np.float64]

@@ -13,7 +13,7 @@ def main() -> int:
     # The work is spread over processes. OpenBLAS' threads, for matrices as small as ours, double the processor time
     # and save nothing (placing 237 images: 4.7 CPU s in 2.5 s with two threads, 2.1 in 2.1 s with one).
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from smust3r_colmap.cli import main as run  # noqa: PLC0415  (see above)
+    from smust3r_colmap.cli.main import main as run  # noqa: PLC0415  (see above)
 
     return run()
 

@@ -23,24 +23,24 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from smust3r_colmap import fusion
-from smust3r_colmap.alignment.edges import Edges, align_pieces, candidate_pairs, needs_maps
+from smust3r_colmap.dense import point_cloud as fusion
+from smust3r_colmap.alignment.pairwise import Edges, align_pieces, candidate_pairs, needs_maps
 from smust3r_colmap.backbones.base import Backbone, BackboneContext, BackboneFactory, BackboneResult
 from smust3r_colmap.backbones.registry import make_backbone, read_options
-from smust3r_colmap.chaining import ChainedPart
+from smust3r_colmap.stitching.spanning_tree import ChainedPart
 from smust3r_colmap.config import RunConfig
-from smust3r_colmap.config_file import config_to_toml
+from smust3r_colmap.storage.config_file import config_to_toml
 from smust3r_colmap.errors import (
     ConfigError,
     DegenerateAlignmentError,
     ReconstructionError,
 )
-from smust3r_colmap.execution import usable_cores
-from smust3r_colmap.exporters.aside import replace_file
+from smust3r_colmap.execution.task_pool import usable_cores
+from smust3r_colmap.exporters.atomic_write import replace_file
 from smust3r_colmap.exporters.colmap_sparse import MODEL_FILES, refuse_names_text_cannot_hold
 from smust3r_colmap.exporters.tum_trajectory import write_tum
-from smust3r_colmap.exports import FORMATS, FormatSettings, Outputs, write_where_possible
-from smust3r_colmap.finished_run import FinishedRun, begin_stages, write_finished
+from smust3r_colmap.exporters.registry import FORMATS, FormatSettings, Outputs, write_where_possible
+from smust3r_colmap.storage.finished_run import FinishedRun, begin_stages, write_finished
 from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.importers.image_folder import (
@@ -51,9 +51,9 @@ from smust3r_colmap.importers.image_folder import (
     collection_from_scan,
 )
 from smust3r_colmap.importers.masks import masks_of, names_without_mask, with_masks
-from smust3r_colmap.loops.planning import LoopPlan, plan_loops
-from smust3r_colmap.masked_maps import without_masked_depth
-from smust3r_colmap.model_depth import depth_scales
+from smust3r_colmap.segmentation.loop_segments import LoopPlan, plan_loops
+from smust3r_colmap.backbones.masked_maps import without_masked_depth
+from smust3r_colmap.dense.depth_consistency import depth_scales
 from smust3r_colmap.products import (
     EMPTY_CLOUD,
     DenseMaps,
@@ -66,18 +66,18 @@ from smust3r_colmap.products import (
     SegmentPiece,
     largest_first,
 )
-from smust3r_colmap.progress import Reporter
-from smust3r_colmap.refinement.refine import Refinement, refine
-from smust3r_colmap.resection import PlacedPiece, place_piece
-from smust3r_colmap.run_directory import RunDirectory, key_of, read_json, write_json
+from smust3r_colmap.execution.progress import Reporter
+from smust3r_colmap.refinement.stage import Refinement, refine
+from smust3r_colmap.stitching.resection import PlacedPiece, place_piece
+from smust3r_colmap.storage.run_directory import RunDirectory, key_of, read_json, write_json
 from smust3r_colmap.segmentation.windows import plan_windows
-from smust3r_colmap.stage_clock import StageClock, peak_memory_bytes
-from smust3r_colmap.stitching import Stitching, stitch
-from smust3r_colmap.stored_alignment import read_edges, write_edges
-from smust3r_colmap.stored_depth import DepthMapWriter, StoredDepthMaps
-from smust3r_colmap.stored_scan import scan_changed_files
-from smust3r_colmap.stored_scene import read_scenes, write_scenes
-from smust3r_colmap.summary import (
+from smust3r_colmap.execution.stage_clock import StageClock, peak_memory_bytes
+from smust3r_colmap.stitching.stitch import Stitching, stitch
+from smust3r_colmap.storage.alignments import read_edges, write_edges
+from smust3r_colmap.storage.depth_maps import DepthMapWriter, StoredDepthMaps
+from smust3r_colmap.storage.image_scan import scan_changed_files
+from smust3r_colmap.storage.scenes import read_scenes, write_scenes
+from smust3r_colmap.report.summary import (
     EdgeSummary,
     GraphSummary,
     ImageRemark,

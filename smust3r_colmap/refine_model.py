@@ -21,16 +21,16 @@ import numpy.typing as npt
 import pycolmap
 
 from smust3r_colmap.alignment.from_poses import align_poses
-from smust3r_colmap.alignment.irls import evenly_chosen
-from smust3r_colmap.backbones.classical.features import match_pairs
-from smust3r_colmap.backbones.classical.run_features import describe_images, features_of_run
+from smust3r_colmap.estimators.sim3 import evenly_chosen
+from smust3r_colmap.features.sift import match_pairs
+from smust3r_colmap.features.stage import describe_images, features_of_run
 from smust3r_colmap.config import RunConfig
 from smust3r_colmap.errors import ConfigError, DegenerateAlignmentError
-from smust3r_colmap.execution import usable_cores
+from smust3r_colmap.execution.task_pool import usable_cores
 from smust3r_colmap.exporters.colmap_sparse import MODEL_FILES, refuse_names_text_cannot_hold
 from smust3r_colmap.exporters.tum_trajectory import write_tum
-from smust3r_colmap.exports import FORMATS, FormatSettings, Outputs, write_where_possible
-from smust3r_colmap.finished_run import FinishedRun, begin_stages, write_finished
+from smust3r_colmap.exporters.registry import FORMATS, FormatSettings, Outputs, write_where_possible
+from smust3r_colmap.storage.finished_run import FinishedRun, begin_stages, write_finished
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.importers.colmap_model import ForeignModel, read_colmap_model
@@ -44,15 +44,15 @@ from smust3r_colmap.importers.image_folder import (
 from smust3r_colmap.importers.masks import masks_of
 from smust3r_colmap.pipeline import masked_as_wanted, refinement_summaries
 from smust3r_colmap.products import FloatArray, ImageCollection, IntArray, PointCloud, RunFeatures, Scene, SegmentPiece
-from smust3r_colmap.progress import Reporter
-from smust3r_colmap.refinement.correspondences import Pair
-from smust3r_colmap.refinement.refine import Refinement, refine, surfaces_of_clouds
-from smust3r_colmap.run_directory import RunDirectory, key_of, write_json
+from smust3r_colmap.execution.progress import Reporter
+from smust3r_colmap.features.correspondences import Pair
+from smust3r_colmap.refinement.stage import Refinement, refine, surfaces_of_clouds
+from smust3r_colmap.storage.run_directory import RunDirectory, key_of, write_json
 from smust3r_colmap.segmentation.windows import plan_windows
-from smust3r_colmap.stage_clock import StageClock, peak_memory_bytes
-from smust3r_colmap.stored_scan import scan_changed_files
-from smust3r_colmap.stored_scene import write_scenes
-from smust3r_colmap.summary import GraphSummary, ImageRemark, ModelSummary, RunSummary
+from smust3r_colmap.execution.stage_clock import StageClock, peak_memory_bytes
+from smust3r_colmap.storage.image_scan import scan_changed_files
+from smust3r_colmap.storage.scenes import write_scenes
+from smust3r_colmap.report.summary import GraphSummary, ImageRemark, ModelSummary, RunSummary
 
 MAX_TURN_DEG = 60.0
 """Of two cameras without points between them: what one sees straight ahead is beyond the edge of the other."""

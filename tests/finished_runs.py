@@ -26,16 +26,16 @@ from tracked_scenes import (
 )
 
 from smust3r_colmap.config import ImportConfig
-from smust3r_colmap.exports import FORMATS, FormatSettings
-from smust3r_colmap.finished_run import FinishedRun, write_finished
+from smust3r_colmap.exporters.registry import FORMATS, FormatSettings
+from smust3r_colmap.storage.finished_run import FinishedRun, write_finished
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.importers.image_folder import collection_from_scan, scan_image_folder
 from smust3r_colmap.products import FloatArray, ImageCollection, PointCloud
-from smust3r_colmap.refinement.task import DATABASE_FILE, MODEL_FOLDER, RefinedFigures, RefineTask, refine_scenes
-from smust3r_colmap.run_directory import RunDirectory, key_of, write_json
-from smust3r_colmap.stored_depth import DepthMapWriter, StoredDepthMaps
-from smust3r_colmap.stored_scene import read_scenes, write_scenes
+from smust3r_colmap.refinement.global_refinement import DATABASE_FILE, MODEL_FOLDER, RefinedFigures, RefineTask, refine_scenes
+from smust3r_colmap.storage.run_directory import RunDirectory, key_of, write_json
+from smust3r_colmap.storage.depth_maps import DepthMapWriter, StoredDepthMaps
+from smust3r_colmap.storage.scenes import read_scenes, write_scenes
 
 CAMERA = Intrinsics(model="SIMPLE_RADIAL", width=320, height=240, params=(290.0, 160.0, 120.0, -0.03))
 NAMES = tuple(f"große Halle/view {k:02d}.png" for k in range(11))

@@ -15,13 +15,13 @@ import numpy.typing as npt
 from smust3r_colmap.backbones.base import BackboneContext
 from smust3r_colmap.backbones.feed_forward import PredictedImage, SegmentPrediction
 from smust3r_colmap.config import RunConfig
-from smust3r_colmap.demo import DemoScene, demo_intrinsics
+from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.images import load_rgb
 from smust3r_colmap.products import ImageCollection, Segment
-from smust3r_colmap.progress import QuietReporter, Stage
-from smust3r_colmap.run_directory import RunDirectory
-from smust3r_colmap.stored_maps import ImageMaps
+from smust3r_colmap.execution.progress import QuietReporter, Stage
+from smust3r_colmap.storage.run_directory import RunDirectory
+from smust3r_colmap.storage.dense_maps import ImageMaps
 
 FloatArray = npt.NDArray[np.float64]
 Float32Array = npt.NDArray[np.float32]

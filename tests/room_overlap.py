@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from smust3r_colmap.alignment.irls import PieceFit
+from smust3r_colmap.estimators.sim3 import PieceFit
 from smust3r_colmap.alignment.seen_points import align_seen_points
 from smust3r_colmap.config import RobustKernel, TransformGroup
 from smust3r_colmap.geometry.sim3 import Sim3

@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 from scenes import rotation_about_y
 
-from smust3r_colmap.backbones.oracle.settings import PRESETS, REFERENCE_LENGTH
-from smust3r_colmap.backbones.oracle.truth import TrueScene
+from smust3r_colmap.synthetic.settings import PRESETS, REFERENCE_LENGTH
+from smust3r_colmap.synthetic.truth import TrueScene
 from smust3r_colmap.config import RunConfig
 from smust3r_colmap.errors import DegenerateAlignmentError, InputError
 from smust3r_colmap.exporters.colmap_sparse import write_colmap_sparse

@@ -29,10 +29,10 @@ from tracked_scenes import (
     true_matches,
 )
 
-from smust3r_colmap.exporters.colmap_database import write_colmap_database
+from smust3r_colmap.colmap.database import write_colmap_database
 from smust3r_colmap.products import FloatArray
-from smust3r_colmap.refinement import adjustment
-from smust3r_colmap.refinement.adjustment import (
+from smust3r_colmap.refinement import bundle_adjustment as adjustment
+from smust3r_colmap.refinement.bundle_adjustment import (
     ENOUGH_OBSERVATIONS,
     MIN_PRIORS,
     PRIOR_SIGMA,

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.alignment.from_pointmaps import align_pointmaps
 from smust3r_colmap.alignment.from_tracks import align_tracks, match_links, point_depths
-from smust3r_colmap.alignment.irls import PieceFit, consensus_sim3, estimate_sim3
+from smust3r_colmap.estimators.sim3 import PieceFit, consensus_sim3, estimate_sim3
 from smust3r_colmap.alignment.seen_points import align_seen_points
 from smust3r_colmap.config import AlignmentConfig, RobustKernel, TransformGroup
 from smust3r_colmap.errors import DegenerateAlignmentError, ReconstructionError

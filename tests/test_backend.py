@@ -15,15 +15,15 @@ import numpy.typing as npt
 import pytest
 
 from smust3r_colmap.backbones.base import BackboneResult
-from smust3r_colmap.backbones.oracle.backbone import OracleBackbone
-from smust3r_colmap.backbones.oracle.settings import PRESETS, OracleSettings
-from smust3r_colmap.backbones.oracle.truth import TrueScene, collection_of
+from smust3r_colmap.synthetic.backbone import OracleBackbone
+from smust3r_colmap.synthetic.settings import PRESETS, OracleSettings
+from smust3r_colmap.synthetic.truth import TrueScene, collection_of
 from smust3r_colmap.config import RunConfig, SegmentationConfig, TransformGroup
-from smust3r_colmap.evaluation import Evaluation, compare_trajectories
+from smust3r_colmap.evaluation.trajectory import Evaluation, compare_trajectories
 from smust3r_colmap.geometry.sim3 import Sim3
-from smust3r_colmap.loops.planning import PlannedLoop
+from smust3r_colmap.segmentation.loop_segments import PlannedLoop
 from smust3r_colmap.products import DenseMaps, Segment, SegmentAlignment, SegmentPiece, SegmentReconstruction
-from smust3r_colmap.stitching import stitch
+from smust3r_colmap.stitching.stitch import stitch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 import ablate

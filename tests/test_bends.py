@@ -6,8 +6,8 @@ from collections.abc import Iterable
 
 import pytest
 
-from smust3r_colmap.refinement.bends import DENYING_SHARE, SOUND_SHARE, STRONG_MATCHES, Agreement, bent_images
-from smust3r_colmap.refinement.correspondences import Pair
+from smust3r_colmap.refinement.misregistration import DENYING_SHARE, SOUND_SHARE, STRONG_MATCHES, Agreement, bent_images
+from smust3r_colmap.features.correspondences import Pair
 
 
 def votes(sound: Iterable[Pair] = (), denied: Iterable[Pair] = ()) -> dict[Pair, Agreement]:

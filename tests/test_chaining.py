@@ -1,7 +1,7 @@
 import numpy as np
 from scenes import some_sim3
 
-from smust3r_colmap.chaining import chain_pieces
+from smust3r_colmap.stitching.spanning_tree import chain_pieces
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.products import SegmentAlignment, TransformEstimate
 

@@ -15,14 +15,16 @@ import pycolmap
 import pytest
 from room_network import install_package
 
-from smust3r_colmap import __version__, cli, doctor
+from smust3r_colmap import __version__
+from smust3r_colmap.cli import main as cli
+from smust3r_colmap.cli import doctor
 from smust3r_colmap.backbones.registry import list_backbones
 from smust3r_colmap.config import RunConfig
-from smust3r_colmap.demo import demo_intrinsics
+from smust3r_colmap.synthetic.room import demo_intrinsics
 from smust3r_colmap.errors import CollectionError, ReconstructionError
-from smust3r_colmap.evaluation import read_poses_txt
+from smust3r_colmap.evaluation.trajectory import read_poses_txt
 from smust3r_colmap.geometry.sim3 import invert_rigid
-from smust3r_colmap.progress import (
+from smust3r_colmap.execution.progress import (
     PlainReporter,
     QuietReporter,
     Reporter,
@@ -30,7 +32,7 @@ from smust3r_colmap.progress import (
     format_seconds,
     reporter_for,
 )
-from smust3r_colmap.summary import (
+from smust3r_colmap.report.summary import (
     EdgeSummary,
     GraphSummary,
     ImageRemark,
@@ -252,7 +254,7 @@ def _write_small_demo(folder: Path, *, num_images: int) -> None:
 
 @pytest.fixture
 def small_demo(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("smust3r_colmap.demo.write_demo", _write_small_demo)
+    monkeypatch.setattr("smust3r_colmap.synthetic.room.write_demo", _write_small_demo)
 
 
 @pytest.mark.usefixtures("small_demo")

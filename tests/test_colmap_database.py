@@ -12,7 +12,7 @@ import pytest
 from finished_runs import CAMERA, NAMES, NUM_PLACED, WITHOUT_FEATURES, Example
 from tracked_scenes import make_collection, true_matches
 
-from smust3r_colmap.exporters.colmap_database import write_colmap_database
+from smust3r_colmap.colmap.database import write_colmap_database
 
 
 @pytest.fixture(scope="module")

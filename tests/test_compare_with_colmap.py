@@ -15,7 +15,7 @@ import pycolmap
 import pytest
 from scenes import rotation_about_y, walk
 
-from smust3r_colmap.evaluation import compare_trajectories
+from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.exporters.tum_trajectory import write_tum
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid

@@ -11,13 +11,13 @@ from finished_runs import NUM_PLACED, Example, refine_corner
 from tracked_scenes import angle_deg, centres_of, poses_of
 
 from smust3r_colmap.config import ImportConfig
-from smust3r_colmap.execution import TaskFailure, TaskResult
+from smust3r_colmap.execution.task_pool import TaskFailure, TaskResult
 from smust3r_colmap.importers.image_folder import collection_from_scan, scan_image_folder
-from smust3r_colmap.refinement import completion as completion_module
-from smust3r_colmap.refinement.bench import Bench
-from smust3r_colmap.refinement.completion import Completion, _MappingTask, complete_model
-from smust3r_colmap.refinement.steps import StepReport
-from smust3r_colmap.run_directory import RunDirectory
+from smust3r_colmap.refinement import registration as completion_module
+from smust3r_colmap.refinement.mapper import Bench
+from smust3r_colmap.refinement.registration import Completion, _MappingTask, complete_model
+from smust3r_colmap.refinement.acceptance import StepReport
+from smust3r_colmap.storage.run_directory import RunDirectory
 
 TAKEN_OUT = 4
 

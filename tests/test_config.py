@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from smust3r_colmap import cli
+from smust3r_colmap.cli import main as cli
 from smust3r_colmap.backbones.classical.plane_sweep import MIN_PLANES
 from smust3r_colmap.config import (
     AlignmentConfig,
@@ -21,7 +21,7 @@ from smust3r_colmap.config import (
     RunConfig,
     SegmentationConfig,
 )
-from smust3r_colmap.config_file import config_from_toml, config_to_toml, flags_from_settings, read_settings
+from smust3r_colmap.storage.config_file import config_from_toml, config_to_toml, flags_from_settings, read_settings
 from smust3r_colmap.errors import ConfigError
 
 # Every group and every type of value differs from its default.

@@ -14,7 +14,7 @@ import pytest
 from finished_runs import NUM_PLACED, Example
 from tracked_scenes import angle_deg, centres_of, poses_of
 
-from smust3r_colmap.execution import TaskFailure, map_tasks
+from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks
 from smust3r_colmap.products import FloatArray
 
 PAGE = Path(__file__).resolve().parents[1] / "docs/continue_in_colmap.md"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from smust3r_colmap.refinement.correspondences import Correspondences, joined
+from smust3r_colmap.features.correspondences import Correspondences, joined
 
 
 def points(count: int, start: float = 0.0) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:

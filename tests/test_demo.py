@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from smust3r_colmap.demo import _BOXES, DemoScene, demo_intrinsics, write_demo
+from smust3r_colmap.synthetic.room import _BOXES, DemoScene, demo_intrinsics, write_demo
 from smust3r_colmap.errors import ConfigError, StorageError
-from smust3r_colmap.evaluation import compare_trajectories, read_poses_txt, read_reference_sparse
+from smust3r_colmap.evaluation.trajectory import compare_trajectories, read_poses_txt, read_reference_sparse
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres, pointmap_from_depth
 from smust3r_colmap.geometry.sim3 import invert_rigid
 

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scenes import make_piece, points_ahead, rotation_about_y, some_sim3, walk
 
-from smust3r_colmap.alignment.edges import Edges, align_pieces, candidate_pairs, disagreement_sigmas
+from smust3r_colmap.alignment.pairwise import Edges, align_pieces, candidate_pairs, disagreement_sigmas
 from smust3r_colmap.alignment.from_tracks import point_depths
 from smust3r_colmap.config import AlignmentConfig, AlignmentEdges, TransformGroup
 from smust3r_colmap.geometry.affine3 import Affine3
 from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.products import FeatureLinks, SegmentPiece
-from smust3r_colmap.stored_alignment import read_edges, write_edges
+from smust3r_colmap.storage.alignments import read_edges, write_edges
 
 
 class Counter:

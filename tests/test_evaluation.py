@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.errors import DegenerateAlignmentError, InputError
-from smust3r_colmap.evaluation import (
+from smust3r_colmap.evaluation.trajectory import (
     compare_trajectories,
     read_poses_txt,
     read_reference_sparse,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from smust3r_colmap.errors import StorageError
-from smust3r_colmap.execution import TaskFailure, TaskPool, living_children_cpu_s, map_tasks
+from smust3r_colmap.execution.task_pool import TaskFailure, TaskPool, living_children_cpu_s, map_tasks
 
 
 def square_unless_told_otherwise(task: int | str) -> int:

@@ -18,7 +18,7 @@ from finished_runs import NAMES, NUM_PLACED, Example, content
 from PIL import Image
 from test_cli import GOOD
 
-from smust3r_colmap import exports
+from smust3r_colmap.exporters import registry as exports
 from smust3r_colmap.errors import (
     CollectionError,
     ConfigError,
@@ -28,13 +28,13 @@ from smust3r_colmap.errors import (
     RunDirectoryError,
     RunLockedError,
 )
-from smust3r_colmap.export_command import Export, FormatName, run_export
+from smust3r_colmap.cli.export import Export, FormatName, run_export
 from smust3r_colmap.exporters.dense_workspace import DenseReport
-from smust3r_colmap.exports import FORMATS, FormatSettings, Written, write_where_possible
-from smust3r_colmap.finished_run import FinishedRun, open_finished
-from smust3r_colmap.progress import QuietReporter
-from smust3r_colmap.run_directory import RunDirectory
-from smust3r_colmap.stage_clock import StageClock
+from smust3r_colmap.exporters.registry import FORMATS, FormatSettings, Written, write_where_possible
+from smust3r_colmap.storage.finished_run import FinishedRun, open_finished
+from smust3r_colmap.execution.progress import QuietReporter
+from smust3r_colmap.storage.run_directory import RunDirectory
+from smust3r_colmap.execution.stage_clock import StageClock
 
 
 def export(*arguments: str | Path) -> int:

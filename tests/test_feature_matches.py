@@ -28,9 +28,9 @@ from tracked_scenes import (
 from smust3r_colmap.errors import StorageError
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import FloatArray
-from smust3r_colmap.refinement import feature_matches
-from smust3r_colmap.refinement.correspondences import Pair
-from smust3r_colmap.refinement.feature_matches import (
+from smust3r_colmap.features import guided_verification as feature_matches
+from smust3r_colmap.features.correspondences import Pair
+from smust3r_colmap.features.guided_verification import (
     MIN_MATCHES,
     MIN_VERIFIED,
     MatchedFeatures,
@@ -225,7 +225,7 @@ def test_database_gives_keypoints_raw_and_verified_matches_by_image_index(world:
 
 
 def test_a_file_that_is_no_database_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("smust3r_colmap.backbones.classical.features._PATIENCE_S", 0.0)
+    monkeypatch.setattr("smust3r_colmap.features.sift._PATIENCE_S", 0.0)
     (tmp_path / "f.db").write_bytes(b"this is no database, whatever its name says" * 100)
     with pytest.raises(StorageError, match=r"f\.db: cannot be opened.*damaged\? Delete .* or start with --fresh"):
         read_matched_features(tmp_path / "f.db", range(3))

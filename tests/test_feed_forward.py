@@ -22,16 +22,16 @@ from smust3r_colmap.backbones.feed_forward import (
     fingerprint_of,
 )
 from smust3r_colmap.config import OutputConfig, RefinementConfig, RunConfig, SegmentationConfig
-from smust3r_colmap.demo import write_demo
+from smust3r_colmap.synthetic.room import write_demo
 from smust3r_colmap.errors import CheckpointError, ReconstructionError
-from smust3r_colmap.evaluation import compare_trajectories, read_poses_txt, read_reference_sparse
+from smust3r_colmap.evaluation.trajectory import compare_trajectories, read_poses_txt, read_reference_sparse
 from smust3r_colmap.geometry.camera import pointmap_from_depth
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.products import ImageCollection, Segment, SourceImage, UnregisteredImage
-from smust3r_colmap.progress import QuietReporter, Stage
-from smust3r_colmap.run_directory import RunDirectory
-from smust3r_colmap.stored_maps import ImageMaps
-from smust3r_colmap.summary import RunSummary
+from smust3r_colmap.execution.progress import QuietReporter, Stage
+from smust3r_colmap.storage.run_directory import RunDirectory
+from smust3r_colmap.storage.dense_maps import ImageMaps
+from smust3r_colmap.report.summary import RunSummary
 
 FloatArray = npt.NDArray[np.float64]
 WIDTH, HEIGHT, NUM_IMAGES = 40, 30, 6

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from smust3r_colmap.fusion import (
+from smust3r_colmap.dense.point_cloud import (
     FusedCameras,
     FusedPoints,
     build_scene,
@@ -27,7 +27,7 @@ from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
 from smust3r_colmap.geometry.sl4 import SL4
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import DenseMaps, FloatArray, ImageCollection, SegmentPiece, SourceImage
-from smust3r_colmap.resection import PlacedPiece, place_piece
+from smust3r_colmap.stitching.resection import PlacedPiece, place_piece
 
 CAMERA = Intrinsics(model="SIMPLE_RADIAL", width=640, height=480, params=(600, 320, 240, -0.05))
 NUM_IMAGES = 14

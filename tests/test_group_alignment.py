@@ -12,9 +12,9 @@ from room_overlap import SIMILARITY, TURN, room_overlap
 from scipy.linalg import logm
 from scipy.spatial.transform import Rotation
 
-from smust3r_colmap.alignment.affine import estimate_affine3
-from smust3r_colmap.alignment.irls import estimate_sim3, transformed
-from smust3r_colmap.alignment.projective import MAX_PAIRS, dlt, estimate_sl4
+from smust3r_colmap.estimators.affine3 import estimate_affine3
+from smust3r_colmap.estimators.sim3 import estimate_sim3, transformed
+from smust3r_colmap.estimators.sl4 import MAX_PAIRS, dlt, estimate_sl4
 from smust3r_colmap.alignment.seen_points import absurdity, align_seen_points
 from smust3r_colmap.config import RobustKernel, TransformGroup
 from smust3r_colmap.errors import DegenerateAlignmentError

@@ -15,7 +15,7 @@ import pytest
 from scenes import points_ahead, rotation_about_y, walk
 from scipy.spatial.transform import Rotation
 
-from smust3r_colmap.demo import DemoScene, demo_intrinsics
+from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
 from smust3r_colmap.errors import InputError
 from smust3r_colmap.geometry.sim3 import invert_rigid
 

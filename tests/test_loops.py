@@ -12,14 +12,14 @@ import pytest
 from scipy.spatial import KDTree
 
 from smust3r_colmap.errors import InputError
-from smust3r_colmap.loops.detection import (
+from smust3r_colmap.segmentation.similarity import (
     alike_segments,
     home_segments,
     neighbours_alike,
     similarity_statistics,
     with_neighbours,
 )
-from smust3r_colmap.loops.planning import LoopCandidate, LoopPlan, images_around, plan_loops
+from smust3r_colmap.segmentation.loop_segments import LoopCandidate, LoopPlan, images_around, plan_loops
 from smust3r_colmap.products import Segment
 from smust3r_colmap.segmentation.windows import plan_windows
 

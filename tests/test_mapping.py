@@ -16,7 +16,7 @@ from scenes import CAMERA, make_piece, points_ahead, rotation_about_y, walk
 
 from smust3r_colmap.backbones.classical import backbone as backbone_module
 from smust3r_colmap.backbones.classical import calibration, mapping
-from smust3r_colmap.backbones.classical import features as features_module
+from smust3r_colmap.features import sift as features_module
 from smust3r_colmap.backbones.classical.backbone import ClassicalBackbone
 from smust3r_colmap.backbones.classical.calibration import (
     CalibrationTask,
@@ -27,8 +27,8 @@ from smust3r_colmap.backbones.classical.calibration import (
     is_better,
     misfits,
 )
-from smust3r_colmap.backbones.classical.descriptors import vlad_descriptors
-from smust3r_colmap.backbones.classical.features import (
+from smust3r_colmap.features.vlad import vlad_descriptors
+from smust3r_colmap.features.sift import (
     _Features,
     _write_features,
     match_pairs,
@@ -53,13 +53,13 @@ from smust3r_colmap.backbones.classical.start_pair import StartPair
 from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
 from smust3r_colmap.config import ClassicalConfig
 from smust3r_colmap.errors import StorageError
-from smust3r_colmap.execution import TaskFailure, TaskPool, TaskResult, map_tasks
+from smust3r_colmap.execution.task_pool import TaskFailure, TaskPool, TaskResult, map_tasks
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.products import ImageCollection, RunFeatures, Segment, SourceImage, Tracks
-from smust3r_colmap.progress import QuietReporter
-from smust3r_colmap.run_directory import RunDirectory
-from smust3r_colmap.statistics import weighted_median
+from smust3r_colmap.execution.progress import QuietReporter
+from smust3r_colmap.storage.run_directory import RunDirectory
+from smust3r_colmap.estimators.weighted_median import weighted_median
 
 NUM_IMAGES = 8
 

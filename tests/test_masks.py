@@ -16,24 +16,24 @@ import pycolmap
 import pytest
 from PIL import ExifTags, Image
 
-from smust3r_colmap import masked_maps
-from smust3r_colmap.backbones.classical import run_features
-from smust3r_colmap.backbones.classical.features import create_database, extract_features
+from smust3r_colmap.backbones import masked_maps
+from smust3r_colmap.features import stage as run_features
+from smust3r_colmap.features.sift import create_database, extract_features
 from smust3r_colmap.config import ClassicalConfig, ImportConfig, LoopConfig, OutputConfig, RunConfig
-from smust3r_colmap.demo import DemoScene, demo_intrinsics
+from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
 from smust3r_colmap.errors import ConfigError, ImageError, InputError, RunDirectoryError
-from smust3r_colmap.evaluation import compare_trajectories, read_reference_sparse
-from smust3r_colmap.export_command import Export, run_export
+from smust3r_colmap.evaluation.trajectory import compare_trajectories, read_reference_sparse
+from smust3r_colmap.cli.export import Export, run_export
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.image_folder import import_image_folder
 from smust3r_colmap.importers.masks import load_mask, names_without_mask, with_masks
-from smust3r_colmap.masked_maps import MaskedMaps
+from smust3r_colmap.backbones.masked_maps import MaskedMaps
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.products import FloatArray, ImageCollection, ImageMask, SourceImage
-from smust3r_colmap.progress import QuietReporter
+from smust3r_colmap.execution.progress import QuietReporter
 from smust3r_colmap.refine_model import CameraChoice, refine_model
-from smust3r_colmap.run_directory import RunDirectory, key_of
-from smust3r_colmap.stored_depth import StoredDepthMaps
+from smust3r_colmap.storage.run_directory import RunDirectory, key_of
+from smust3r_colmap.storage.depth_maps import StoredDepthMaps
 
 WIDTH, HEIGHT, NUM_IMAGES = 320, 240, 8
 CAMERA = demo_intrinsics(WIDTH, HEIGHT)

@@ -28,7 +28,7 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from smust3r_colmap.errors import InputError, MissingDependencyError, ReconstructionError
-from smust3r_colmap.execution import TaskFailure, TaskResult
+from smust3r_colmap.execution.task_pool import TaskFailure, TaskResult
 from smust3r_colmap.exporters import mesh as mesh_module
 from smust3r_colmap.exporters.dense_workspace import write_map
 from smust3r_colmap.exporters.mesh import MeshMethod, write_mesh

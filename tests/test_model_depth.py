@@ -21,9 +21,9 @@ from dense_scenes import (
     undistorted,
 )
 
-from smust3r_colmap import model_depth
+from smust3r_colmap.dense import depth_consistency as model_depth
 from smust3r_colmap.errors import InputError
-from smust3r_colmap.model_depth import ModelDepth, depth_of_model, sample_depth
+from smust3r_colmap.dense.depth_consistency import ModelDepth, depth_of_model, sample_depth
 
 
 @pytest.fixture(scope="module")

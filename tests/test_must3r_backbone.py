@@ -30,13 +30,13 @@ from smust3r_colmap.backbones.must3r.backbone import Must3rPredictor, make_must3
 from smust3r_colmap.backbones.must3r.checkpoint import write_safetensors_checkpoint
 from smust3r_colmap.backbones.must3r.recipe import recipe_weights
 from smust3r_colmap.backbones.must3r.state_dicts import empty_parts
-from smust3r_colmap.cli import main
+from smust3r_colmap.cli.main import main
 from smust3r_colmap.config import CameraFit, ImportConfig, KeyframeStrategy, Must3rConfig, RunConfig
-from smust3r_colmap.demo import write_demo
+from smust3r_colmap.synthetic.room import write_demo
 from smust3r_colmap.importers.image_folder import import_image_folder
 from smust3r_colmap.products import Segment
-from smust3r_colmap.progress import QuietReporter, StageTally
-from smust3r_colmap.run_directory import RunDirectory
+from smust3r_colmap.execution.progress import QuietReporter, StageTally
+from smust3r_colmap.storage.run_directory import RunDirectory
 
 NUM_IMAGES = 14
 ROPE = Rope(trained_size=64, size=64)

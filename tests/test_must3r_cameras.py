@@ -25,8 +25,8 @@ from smust3r_colmap.backbones.must3r.full_image import LARGEST_CONFIDENCE, full_
 from smust3r_colmap.backbones.must3r.head import Pointmaps
 from smust3r_colmap.backbones.must3r.pose_refinement import refine_pose
 from smust3r_colmap.backbones.must3r.preprocessing import NetworkWindow, choose_window
-from smust3r_colmap.backbones.oracle.distortion import confidence_of, smooth_basis
-from smust3r_colmap.backbones.oracle.truth import TrueScene
+from smust3r_colmap.synthetic.distortion import confidence_of, smooth_basis
+from smust3r_colmap.synthetic.truth import TrueScene
 from smust3r_colmap.config import CameraFit
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres

@@ -17,9 +17,9 @@ import pycolmap
 import pytest
 import trimesh
 
-from smust3r_colmap.cli import main
-from smust3r_colmap.demo import write_demo
-from smust3r_colmap.evaluation import Evaluation, compare_trajectories, read_poses_txt, read_reference_sparse
+from smust3r_colmap.cli.main import main
+from smust3r_colmap.synthetic.room import write_demo
+from smust3r_colmap.evaluation.trajectory import Evaluation, compare_trajectories, read_poses_txt, read_reference_sparse
 
 STAND_IN = Path(__file__).parent / "data" / "must3r_stand_in.safetensors"
 NUM_IMAGES = 60

@@ -32,7 +32,7 @@ from smust3r_colmap.backbones.must3r import (
 from smust3r_colmap.backbones.must3r.cameras import estimate_focal, register_camera
 from smust3r_colmap.backbones.must3r.decoder import Decoder
 from smust3r_colmap.backbones.must3r.preprocessing import preprocess
-from smust3r_colmap.demo import DemoScene, demo_intrinsics
+from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
 from smust3r_colmap.geometry.camera import pointmap_from_depth
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.geometry.so3 import angles_between

@@ -13,20 +13,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.alignment.from_pointmaps import align_pointmaps
-from smust3r_colmap.alignment.irls import PieceFit
+from smust3r_colmap.estimators.sim3 import PieceFit
 from smust3r_colmap.backbones.base import Backbone
-from smust3r_colmap.backbones.oracle.backbone import (
+from smust3r_colmap.synthetic.backbone import (
     OracleBackbone,
     OracleMaps,
     oracle_maps,
     taken_for_each_other,
     true_relation,
 )
-from smust3r_colmap.backbones.oracle.descriptors import FALSE_COSINE, FalseLoop, overlap_matrix
-from smust3r_colmap.backbones.oracle.settings import PRESETS, REFERENCE_LENGTH, OracleSettings
-from smust3r_colmap.backbones.oracle.truth import TYPICAL_DEPTH_IMAGES, TrueScene, collection_of, z_buffer
+from smust3r_colmap.synthetic.descriptors import FALSE_COSINE, FalseLoop, overlap_matrix
+from smust3r_colmap.synthetic.settings import PRESETS, REFERENCE_LENGTH, OracleSettings
+from smust3r_colmap.synthetic.truth import TYPICAL_DEPTH_IMAGES, TrueScene, collection_of, z_buffer
 from smust3r_colmap.config import AlignmentConfig
-from smust3r_colmap.demo import demo_intrinsics
+from smust3r_colmap.synthetic.room import demo_intrinsics
 from smust3r_colmap.errors import CollectionError, ConfigError, DegenerateAlignmentError, ImageError, InputError
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres, pointmap_from_depth
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid

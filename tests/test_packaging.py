@@ -86,7 +86,7 @@ def test_pins_are_exact_and_name_no_place() -> None:
 def test_help_loads_no_heavy_package() -> None:
     program = """
 import contextlib, sys
-from smust3r_colmap.cli import main
+from smust3r_colmap.cli.main import main
 with contextlib.suppress(SystemExit):
     main(["reconstruct", "--help"])
 heavy = {"torch", "open3d", "pycolmap", "cv2", "numpy", "scipy", "trimesh"}
@@ -101,7 +101,7 @@ print("LOADED", sorted(heavy & set(sys.modules)))
 def test_a_reconstruction_loads_neither_torch_nor_open3d() -> None:
     program = """
 import sys
-import smust3r_colmap.cli, smust3r_colmap.pipeline
+import smust3r_colmap.cli.main, smust3r_colmap.pipeline
 print(sorted({"torch", "open3d"} & set(sys.modules)))
 """
     child = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

@@ -11,7 +11,7 @@ from tracked_scenes import CAMERA, arc, cam_from_world_towards, straight
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import FloatArray
-from smust3r_colmap.refinement.pair_selection import (
+from smust3r_colmap.features.covisibility import (
     MIN_SCORE,
     SAME_PLACE,
     SeenSurface,

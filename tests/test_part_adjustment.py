@@ -19,9 +19,9 @@ from tracked_scenes import (
     rms,
 )
 
-from smust3r_colmap.refinement import part_adjustment
-from smust3r_colmap.refinement.adjustment import adjust, figures_of, priors_of
-from smust3r_colmap.refinement.part_adjustment import adjust_on_part, part_of
+from smust3r_colmap.refinement import subset_adjustment as part_adjustment
+from smust3r_colmap.refinement.bundle_adjustment import adjust, figures_of, priors_of
+from smust3r_colmap.refinement.subset_adjustment import adjust_on_part, part_of
 
 pytestmark = pytest.mark.usefixtures("quiet_pycolmap")
 

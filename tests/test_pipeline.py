@@ -33,14 +33,14 @@ from smust3r_colmap.config import (
     SegmentationConfig,
     TransformGroup,
 )
-from smust3r_colmap.config_file import config_to_toml
-from smust3r_colmap.demo import DemoScene, demo_intrinsics, write_demo
+from smust3r_colmap.storage.config_file import config_to_toml
+from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics, write_demo
 from smust3r_colmap.errors import CollectionError, ConfigError, InputError, ReconstructionError
-from smust3r_colmap.evaluation import compare_trajectories, read_poses_txt, read_reference_sparse
+from smust3r_colmap.evaluation.trajectory import compare_trajectories, read_poses_txt, read_reference_sparse
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.pipeline import reconstruct
-from smust3r_colmap.progress import QuietReporter
-from smust3r_colmap.summary import RunSummary
+from smust3r_colmap.execution.progress import QuietReporter
+from smust3r_colmap.report.summary import RunSummary
 
 NUM_IMAGES = 24
 NUM_BRIEF = 12

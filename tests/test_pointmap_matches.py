@@ -15,12 +15,12 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from smust3r_colmap.demo import DemoScene, demo_intrinsics
-from smust3r_colmap.evaluation import compare_trajectories
+from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
+from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.geometry.sim3 import invert_rigid
-from smust3r_colmap.refinement.correspondences import Correspondences, Pair
-from smust3r_colmap.refinement.pointmap_matches import (
+from smust3r_colmap.features.correspondences import Correspondences, Pair
+from smust3r_colmap.features.pointmap_matching import (
     CACHED_VIEWS,
     MappedView,
     align_patches,

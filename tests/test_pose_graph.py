@@ -13,20 +13,20 @@ from smust3r_colmap.geometry.affine3 import Affine3
 from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.pose_graph.contract import contract
-from smust3r_colmap.pose_graph.graph import TRUSTED, PoseGraph
-from smust3r_colmap.pose_graph.levenberg import levenberg_marquardt, quadratic
-from smust3r_colmap.pose_graph.linearise import (
+from smust3r_colmap.stitching.pose_graph.contract import contract
+from smust3r_colmap.stitching.pose_graph.graph import TRUSTED, PoseGraph
+from smust3r_colmap.stitching.pose_graph.levenberg import levenberg_marquardt, quadratic
+from smust3r_colmap.stitching.pose_graph.linearise import (
     NormalEquations,
     edge_errors,
     inverse_right_jacobian,
     linearise,
     squared_distances,
 )
-from smust3r_colmap.pose_graph.normalise import Normalisation
-from smust3r_colmap.pose_graph.optimise import optimise
-from smust3r_colmap.pose_graph.robust import leave_one_out
-from smust3r_colmap.pose_graph.start import linear_part, only_linear, part_of
+from smust3r_colmap.stitching.pose_graph.normalise import Normalisation
+from smust3r_colmap.stitching.pose_graph.optimise import optimise
+from smust3r_colmap.stitching.pose_graph.robust import leave_one_out
+from smust3r_colmap.stitching.pose_graph.start import linear_part, only_linear, part_of
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -518,7 +518,7 @@ def test_components_are_solved_as_if_alone() -> None:
 
 def test_a_worse_state_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """The descent is made to end somewhere bad; the start comes back and the reason says so."""
-    from smust3r_colmap.pose_graph import optimise as module  # noqa: PLC0415
+    from smust3r_colmap.stitching.pose_graph import optimise as module
 
     _, graph, start, _ = measured_ring(31, 3)
     real = levenberg_marquardt

@@ -35,12 +35,14 @@ from tracked_scenes import (
 )
 
 from smust3r_colmap.config import RefinementConfig, RunConfig
-from smust3r_colmap.execution import TaskFailure, TaskResult
+from smust3r_colmap.execution.task_pool import TaskFailure, TaskResult
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import FloatArray, RunFeatures
-from smust3r_colmap.progress import QuietReporter
-from smust3r_colmap.refinement import principal_point, refine, task
-from smust3r_colmap.refinement.adjustment import Priors, adjust, priors_of
+from smust3r_colmap.execution.progress import QuietReporter
+from smust3r_colmap.refinement import principal_point
+from smust3r_colmap.refinement import stage as refine
+from smust3r_colmap.refinement import global_refinement as task
+from smust3r_colmap.refinement.bundle_adjustment import Priors, adjust, priors_of
 from smust3r_colmap.refinement.principal_point import (
     AGREEMENT,
     MAX_SHIFT,
@@ -49,9 +51,9 @@ from smust3r_colmap.refinement.principal_point import (
     PrincipalPointAnswer,
     ask_for_principal_points,
 )
-from smust3r_colmap.refinement.task import RefinedFigures, RefineTask, refine_scenes
-from smust3r_colmap.run_directory import RunDirectory, StageFolder
-from smust3r_colmap.stage_clock import StageClock
+from smust3r_colmap.refinement.global_refinement import RefinedFigures, RefineTask, refine_scenes
+from smust3r_colmap.storage.run_directory import RunDirectory, StageFolder
+from smust3r_colmap.execution.stage_clock import StageClock
 
 pytestmark = pytest.mark.usefixtures("quiet_pycolmap")
 

@@ -14,10 +14,10 @@ import pytest
 from read_colmap_independently import read_binary
 
 from smust3r_colmap.config import ClassicalConfig, FusionConfig, OutputConfig, RunConfig, SegmentationConfig
-from smust3r_colmap.evaluation import Evaluation, compare_trajectories, read_poses_txt, read_reference_sparse
+from smust3r_colmap.evaluation.trajectory import Evaluation, compare_trajectories, read_poses_txt, read_reference_sparse
 from smust3r_colmap.pipeline import reconstruct
-from smust3r_colmap.progress import QuietReporter
-from smust3r_colmap.summary import RunSummary
+from smust3r_colmap.execution.progress import QuietReporter
+from smust3r_colmap.report.summary import RunSummary
 
 CONFIG = RunConfig(
     segmentation=SegmentationConfig(segment_length=8, overlap=4),

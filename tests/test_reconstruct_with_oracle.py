@@ -12,7 +12,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.errors import InputError
-from smust3r_colmap.evaluation import compare_trajectories, read_poses_txt, read_reference_sparse
+from smust3r_colmap.evaluation.trajectory import compare_trajectories, read_poses_txt, read_reference_sparse
 from smust3r_colmap.geometry.camera import pixel_centres
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))

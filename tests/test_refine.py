@@ -42,18 +42,20 @@ from tracked_scenes import (
 
 from smust3r_colmap.config import RefinementConfig, RunConfig
 from smust3r_colmap.errors import ConfigError
-from smust3r_colmap.execution import TaskResult
+from smust3r_colmap.execution.task_pool import TaskResult
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import FloatArray, ImageCollection, PointCloud, RunFeatures, Scene
-from smust3r_colmap.progress import QuietReporter, Stage
-from smust3r_colmap.refinement import adjustment, refine, task
-from smust3r_colmap.refinement.adjustment import ENOUGH_OBSERVATIONS, MANY_OBSERVATIONS, figures_of
-from smust3r_colmap.refinement.bench import Bench
-from smust3r_colmap.refinement.correspondences import Pair
-from smust3r_colmap.refinement.refine import Refinement, surfaces_of_clouds
-from smust3r_colmap.refinement.task import RefinedFigures, RefineTask, refine_scenes
-from smust3r_colmap.run_directory import RunDirectory, StageFolder, read_json
-from smust3r_colmap.stage_clock import StageClock
+from smust3r_colmap.execution.progress import QuietReporter, Stage
+from smust3r_colmap.refinement import bundle_adjustment as adjustment
+from smust3r_colmap.refinement import stage as refine
+from smust3r_colmap.refinement import global_refinement as task
+from smust3r_colmap.refinement.bundle_adjustment import ENOUGH_OBSERVATIONS, MANY_OBSERVATIONS, figures_of
+from smust3r_colmap.refinement.mapper import Bench
+from smust3r_colmap.features.correspondences import Pair
+from smust3r_colmap.refinement.stage import Refinement, surfaces_of_clouds
+from smust3r_colmap.refinement.global_refinement import RefinedFigures, RefineTask, refine_scenes
+from smust3r_colmap.storage.run_directory import RunDirectory, StageFolder, read_json
+from smust3r_colmap.execution.stage_clock import StageClock
 
 pytestmark = pytest.mark.usefixtures("quiet_pycolmap")
 

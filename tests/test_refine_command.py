@@ -18,16 +18,16 @@ import tyro
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from smust3r_colmap.demo import DemoScene, demo_intrinsics
+from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
 from smust3r_colmap.errors import ConfigError, InputError
-from smust3r_colmap.evaluation import Evaluation, compare_trajectories, read_reference_sparse
+from smust3r_colmap.evaluation.trajectory import Evaluation, compare_trajectories, read_reference_sparse
 from smust3r_colmap.geometry.camera import pointmap_from_depth
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
 from smust3r_colmap.products import EMPTY_CLOUD, Scene
-from smust3r_colmap.progress import QuietReporter
-from smust3r_colmap.refine_command import Refine, run_refine
+from smust3r_colmap.execution.progress import QuietReporter
+from smust3r_colmap.cli.refine import Refine, run_refine
 from smust3r_colmap.refine_model import alike_pairs, neighbouring_pairs, refined_from_start
-from smust3r_colmap.summary import RunSummary
+from smust3r_colmap.report.summary import RunSummary
 from smust3r_colmap.validation.surroundings import read_ply
 
 FloatArray = npt.NDArray[np.float64]

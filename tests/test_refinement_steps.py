@@ -10,9 +10,9 @@ import pycolmap
 import pytest
 from tracked_scenes import rig_from_world
 
-from smust3r_colmap.refinement import steps
-from smust3r_colmap.refinement.adjustment import extent_of, figures_of
-from smust3r_colmap.refinement.steps import (
+from smust3r_colmap.refinement import acceptance as steps
+from smust3r_colmap.refinement.bundle_adjustment import extent_of, figures_of
+from smust3r_colmap.refinement.acceptance import (
     FOCAL_RANGE,
     MAX_LOST,
     MAX_PRINCIPAL_POINT_SHIFT,

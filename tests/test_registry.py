@@ -26,13 +26,13 @@ from smust3r_colmap.backbones.registry import (
     read_options,
 )
 from smust3r_colmap.config import OutputConfig, RunConfig, SegmentationConfig
-from smust3r_colmap.demo import write_demo
+from smust3r_colmap.synthetic.room import write_demo
 from smust3r_colmap.errors import CheckpointError, ConfigError, MissingDependencyError
-from smust3r_colmap.evaluation import compare_trajectories, read_poses_txt, read_reference_sparse
+from smust3r_colmap.evaluation.trajectory import compare_trajectories, read_poses_txt, read_reference_sparse
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.products import ImageCollection
-from smust3r_colmap.progress import QuietReporter
-from smust3r_colmap.run_directory import RunDirectory
+from smust3r_colmap.execution.progress import QuietReporter
+from smust3r_colmap.storage.run_directory import RunDirectory
 
 PAGE = Path(__file__).resolve().parents[1] / "docs/backbones.md"
 EMPTY = ImageCollection(images=(), cameras=())

@@ -27,13 +27,13 @@ from tracked_scenes import (
 
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import FloatArray
-from smust3r_colmap.refinement import replacement
-from smust3r_colmap.refinement.adjustment import Tolerance, triangulate
-from smust3r_colmap.refinement.bench import TIGHT_PART, Bench, poses_of, views_of
-from smust3r_colmap.refinement.feature_matches import MatchedFeatures, ask_consent, read_matched_features
-from smust3r_colmap.refinement.replacement import Replacement, place_bent_images_again
-from smust3r_colmap.refinement.task import RefineTask, refine_scenes
-from smust3r_colmap.run_directory import StageFolder
+from smust3r_colmap.refinement import reregistration as replacement
+from smust3r_colmap.refinement.bundle_adjustment import Tolerance, triangulate
+from smust3r_colmap.refinement.mapper import TIGHT_PART, Bench, poses_of, views_of
+from smust3r_colmap.features.guided_verification import MatchedFeatures, ask_consent, read_matched_features
+from smust3r_colmap.refinement.reregistration import Replacement, place_bent_images_again
+from smust3r_colmap.refinement.global_refinement import RefineTask, refine_scenes
+from smust3r_colmap.storage.run_directory import StageFolder
 
 pytestmark = pytest.mark.usefixtures("quiet_pycolmap")
 

@@ -19,7 +19,7 @@ from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
 from smust3r_colmap.geometry.sl4 import SL4
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import SegmentPiece
-from smust3r_colmap.resection import PlacedPiece, moved_cameras, place_piece
+from smust3r_colmap.stitching.resection import PlacedPiece, moved_cameras, place_piece
 
 FloatArray = npt.NDArray[np.float64]
 IMAGES = tuple(range(6))

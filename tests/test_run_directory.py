@@ -10,7 +10,7 @@ import pytest
 
 from smust3r_colmap.errors import RunDirectoryError, RunLockedError, StorageError
 from smust3r_colmap.geometry.camera import Intrinsics
-from smust3r_colmap.run_directory import (
+from smust3r_colmap.storage.run_directory import (
     RunDirectory,
     key_of,
     read_array,
@@ -79,7 +79,7 @@ def test_a_second_process_is_refused_while_the_first_lives(tmp_path: Path) -> No
     root = tmp_path / "out"
     code = f"""
 from pathlib import Path
-from smust3r_colmap.run_directory import RunDirectory
+from smust3r_colmap.storage.run_directory import RunDirectory
 RunDirectory(Path({str(root)!r}))
 """
     with RunDirectory(root):
@@ -95,7 +95,7 @@ def test_a_lock_that_a_killed_run_leaves_for_a_moment_is_waited_for(tmp_path: Pa
     code = f"""
 import time
 from pathlib import Path
-from smust3r_colmap.run_directory import RunDirectory
+from smust3r_colmap.storage.run_directory import RunDirectory
 with RunDirectory(Path({str(root)!r})):
     print("held", flush=True)
     time.sleep(0.5)

@@ -30,7 +30,7 @@ from smust3r_colmap.backbones.classical.start_pair import (
     StartPair,
     choose_start_pairs,
 )
-from smust3r_colmap.exporters.colmap_database import write_colmap_database
+from smust3r_colmap.colmap.database import write_colmap_database
 from smust3r_colmap.products import FloatArray
 
 pytestmark = pytest.mark.usefixtures("quiet_pycolmap")

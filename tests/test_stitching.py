@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 from scenes import CAMERA, rotation_about_y, some_sim3
 
-from smust3r_colmap import pipeline, stitching
+from smust3r_colmap import pipeline
+from smust3r_colmap.stitching import stitch as stitching
 from smust3r_colmap.backbones.base import BackboneResult
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.geometry.affine3 import Affine3
 from smust3r_colmap.geometry.sim3 import Sim3
-from smust3r_colmap.loops.planning import PlannedLoop
-from smust3r_colmap.loops.verification import LoopVerdict, UncertainTransform, covariance_of
-from smust3r_colmap.pose_graph.graph import PoseGraph
-from smust3r_colmap.pose_graph.optimise import GraphSolution, optimise
+from smust3r_colmap.segmentation.loop_segments import PlannedLoop
+from smust3r_colmap.stitching.loop_verification import LoopVerdict, UncertainTransform, covariance_of
+from smust3r_colmap.stitching.pose_graph.graph import PoseGraph
+from smust3r_colmap.stitching.pose_graph.optimise import GraphSolution, optimise
 from smust3r_colmap.products import (
     ImageCollection,
     Segment,
@@ -26,10 +27,10 @@ from smust3r_colmap.products import (
     SegmentReconstruction,
     TransformEstimate,
 )
-from smust3r_colmap.progress import QuietReporter
-from smust3r_colmap.stage_clock import StageClock
-from smust3r_colmap.stitching import ClosureGap, Stitching, closure_gap, stitch
-from smust3r_colmap.stored_maps import EmptyMaps
+from smust3r_colmap.execution.progress import QuietReporter
+from smust3r_colmap.execution.stage_clock import StageClock
+from smust3r_colmap.stitching.stitch import ClosureGap, Stitching, closure_gap, stitch
+from smust3r_colmap.storage.dense_maps import EmptyMaps
 
 NUM_IMAGES, LENGTH, STEP = 96, 16, 8
 SIGMA = np.array([0.02, 0.02, 0.02, 0.01, 0.01, 0.01, 0.01])

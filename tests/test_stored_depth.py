@@ -10,8 +10,8 @@ import pytest
 from test_fusion import CAMERA, MAP_SIZES, NUM_IMAGES, make_world, sphere_depth
 
 from smust3r_colmap.errors import StorageError
-from smust3r_colmap.fusion import depth_in_cameras, fuse_points
-from smust3r_colmap.stored_depth import DepthMapWriter, StoredDepthMaps
+from smust3r_colmap.dense.point_cloud import depth_in_cameras, fuse_points
+from smust3r_colmap.storage.depth_maps import DepthMapWriter, StoredDepthMaps
 
 NAMES = ("a/b c.jpg", "Größe 画像.png", "../odd.jpg")
 

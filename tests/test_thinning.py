@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from smust3r_colmap.backbones.classical.features import Pair
+from smust3r_colmap.features.sift import Pair
 from smust3r_colmap.backbones.classical.thinning import (
     ENOUGH_FEATURES,
     ENOUGH_IN_SEGMENT,

@@ -13,16 +13,16 @@ from PIL import Image
 from tracked_scenes import disturbed, stitched_scene
 
 from smust3r_colmap.config import ImportConfig, RefinementConfig, RunConfig, TrackSource
-from smust3r_colmap.demo import DemoScene, demo_intrinsics
-from smust3r_colmap.evaluation import compare_trajectories
+from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
+from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.importers.image_folder import collection_from_scan, scan_image_folder
 from smust3r_colmap.products import FloatArray
-from smust3r_colmap.progress import QuietReporter
-from smust3r_colmap.refinement.refine import Refinement, refine
-from smust3r_colmap.run_directory import RunDirectory
-from smust3r_colmap.stage_clock import StageClock
-from smust3r_colmap.stored_depth import DepthMapWriter, StoredDepthMaps
+from smust3r_colmap.execution.progress import QuietReporter
+from smust3r_colmap.refinement.stage import Refinement, refine
+from smust3r_colmap.storage.run_directory import RunDirectory
+from smust3r_colmap.execution.stage_clock import StageClock
+from smust3r_colmap.storage.depth_maps import DepthMapWriter, StoredDepthMaps
 
 NUM_IMAGES, WITHOUT_POSE = 7, 6
 CAMERA = demo_intrinsics(320, 240)

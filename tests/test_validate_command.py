@@ -16,7 +16,7 @@ import pytest
 import tyro
 
 from smust3r_colmap.errors import ConfigError, InputError
-from smust3r_colmap.validate_command import Validate, run_validate
+from smust3r_colmap.cli.validate import Validate, run_validate
 from smust3r_colmap.validation import validate as validation
 
 
@@ -204,7 +204,7 @@ def test_findings_are_wrapped_for_a_terminal_only(
 
 def test_the_command_is_imported_without_anything_heavy() -> None:
     program = (
-        "import sys, smust3r_colmap.validate_command\n"
+        "import sys, smust3r_colmap.cli.validate\n"
         "print(sorted({'numpy', 'pycolmap', 'scipy', 'PIL', 'cv2'} & set(sys.modules)))"
     )
     child = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

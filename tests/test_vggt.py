@@ -27,13 +27,13 @@ from smust3r_colmap.backbones.registry import make_backbone
 from smust3r_colmap.backbones.vggt import Crop, VggtPredictor
 from smust3r_colmap.config import LoopConfig, OutputConfig, RefinementConfig, RunConfig, SegmentationConfig
 from smust3r_colmap.errors import CheckpointError, ConfigError, MissingDependencyError, ReconstructionError
-from smust3r_colmap.evaluation import compare_trajectories, read_reference_sparse
+from smust3r_colmap.evaluation.trajectory import compare_trajectories, read_reference_sparse
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.images import load_rgb
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.products import ImageCollection, Segment, SourceImage
-from smust3r_colmap.progress import QuietReporter
-from smust3r_colmap.run_directory import RunDirectory
+from smust3r_colmap.execution.progress import QuietReporter
+from smust3r_colmap.storage.run_directory import RunDirectory
 
 FloatArray = npt.NDArray[np.float64]
 

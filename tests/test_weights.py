@@ -25,14 +25,16 @@ import numpy as np
 import pytest
 from must3r_vectors import REFERENCE
 
-from smust3r_colmap import cli, weights_command
+from smust3r_colmap.cli import main as cli
+from smust3r_colmap.cli import weights as weights_command
 from smust3r_colmap.errors import CheckpointError, ConfigError, DownloadError
-from smust3r_colmap.progress import PlainReporter
-from smust3r_colmap.weights import cache, catalogue
-from smust3r_colmap.weights.cache import find_weights, named_file, part_of, weights_folder
-from smust3r_colmap.weights.catalogue import CATALOGUE, LICENCE_SUMMARY, official
-from smust3r_colmap.weights.checksum import verify
-from smust3r_colmap.weights.download import download
+from smust3r_colmap.execution.progress import PlainReporter
+from smust3r_colmap.backbones.weights import cache
+from smust3r_colmap.backbones.weights import catalogue
+from smust3r_colmap.backbones.weights.cache import find_weights, named_file, part_of, weights_folder
+from smust3r_colmap.backbones.weights.catalogue import CATALOGUE, LICENCE_SUMMARY, official
+from smust3r_colmap.backbones.weights.checksum import verify
+from smust3r_colmap.backbones.weights.download import download
 
 MIB = 2**20
 CONTENT = np.random.default_rng(0).bytes(5 * MIB // 2)
@@ -429,7 +431,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background
 from dataclasses import replace
 from smust3r_colmap.weights import catalogue
 catalogue.CATALOGUE = [replace(catalogue.CATALOGUE[0], md5=sys.argv[1])]
-from smust3r_colmap.cli import main
+from smust3r_colmap.cli.main import main
 sys.exit(main(["weights", "fetch", "--accept-licence", "--base-url", sys.argv[2]]))
 """
 
@@ -879,7 +881,7 @@ def test_help_tells_what_may_be_left_out(
 def test_help_of_weights_needs_no_network_code() -> None:
     program = """
 import contextlib, sys
-from smust3r_colmap.cli import main
+from smust3r_colmap.cli.main import main
 with contextlib.suppress(SystemExit):
     main(["weights", "fetch", "--help"])
 print("LOADED", sorted({"torch", "numpy", "urllib.request", "filelock"} & set(sys.modules)))

@@ -13,11 +13,11 @@ import pycolmap
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from smust3r_colmap.backbones.classical.features import write_images
+from smust3r_colmap.features.sift import write_images
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import EMPTY_CLOUD, FloatArray, ImageCollection, IntArray, Scene, SourceImage
-from smust3r_colmap.refinement.correspondences import Pair
+from smust3r_colmap.features.correspondences import Pair
 
 CAMERA = Intrinsics(model="SIMPLE_RADIAL", width=640, height=480, params=(560.0, 320.0, 240.0, -0.04))
 COLOUR = (200, 120, 40)

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.alignment.irls import PieceFit, evenly_chosen
+from smust3r_colmap.estimators.sim3 import PieceFit, evenly_chosen
 from smust3r_colmap.alignment.seen_points import align_seen_points
-from smust3r_colmap.confidence import reweighted
+from smust3r_colmap.estimators.confidence import reweighted
 from smust3r_colmap.config import AlignmentConfig, ConfidenceWeighting
 from smust3r_colmap.errors import DegenerateAlignmentError, ReconstructionError
 from smust3r_colmap.products import DenseMaps, SegmentPiece

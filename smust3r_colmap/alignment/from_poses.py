@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from smust3r_colmap.alignment.irls import (
+from smust3r_colmap.estimators.sim3 import (
     CAUCHY_TUNING,
     MAD_TO_SIGMA,
     REDESCENDING_ITERATIONS,

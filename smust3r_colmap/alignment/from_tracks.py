@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.alignment.irls import PieceFit
+from smust3r_colmap.estimators.sim3 import PieceFit
 from smust3r_colmap.alignment.seen_points import align_seen_points
 from smust3r_colmap.config import AlignmentConfig
 from smust3r_colmap.errors import DegenerateAlignmentError

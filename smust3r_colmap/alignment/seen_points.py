@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.alignment.affine import estimate_affine3
-from smust3r_colmap.alignment.irls import (
+from smust3r_colmap.estimators.affine3 import estimate_affine3
+from smust3r_colmap.estimators.sim3 import (
     PieceFit,
     consensus_sim3,
     estimate_sim3,
@@ -22,7 +22,7 @@ from smust3r_colmap.alignment.irls import (
     homogeneous,
     point_distances,
 )
-from smust3r_colmap.alignment.projective import estimate_sl4
+from smust3r_colmap.estimators.sl4 import estimate_sl4
 from smust3r_colmap.config import RobustKernel, TransformGroup
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.geometry.sim3 import Sim3

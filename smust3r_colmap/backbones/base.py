@@ -24,8 +24,8 @@ from smust3r_colmap.products import (
     SegmentPiece,
     SegmentReconstruction,
 )
-from smust3r_colmap.progress import Reporter
-from smust3r_colmap.run_directory import RunDirectory
+from smust3r_colmap.execution.progress import Reporter
+from smust3r_colmap.storage.run_directory import RunDirectory
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

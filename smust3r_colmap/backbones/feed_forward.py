@@ -29,8 +29,8 @@ from smust3r_colmap.products import (
     SegmentReconstruction,
     UnregisteredImage,
 )
-from smust3r_colmap.progress import Reporter, Stage
-from smust3r_colmap.run_directory import (
+from smust3r_colmap.execution.progress import Reporter, Stage
+from smust3r_colmap.storage.run_directory import (
     RunDirectory,
     StageFolder,
     key_of,
@@ -39,7 +39,7 @@ from smust3r_colmap.run_directory import (
     write_arrays,
     write_json,
 )
-from smust3r_colmap.stored_maps import ImageMaps, StoredMaps, write_maps
+from smust3r_colmap.storage.dense_maps import ImageMaps, StoredMaps, write_maps
 
 MIN_IMAGES = 2
 """Of a piece; one image has no baseline and ties nothing."""

@@ -21,8 +21,8 @@ import numpy as np
 import pycolmap
 
 from smust3r_colmap.products import FloatArray
-from smust3r_colmap.refinement.adjustment import Priors, adjust, robust_cost
-from smust3r_colmap.refinement.part_adjustment import part_of
+from smust3r_colmap.refinement.bundle_adjustment import Priors, adjust, robust_cost
+from smust3r_colmap.refinement.subset_adjustment import part_of
 
 logger = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from pathlib import PurePosixPath
 import numpy as np
 
 from smust3r_colmap.errors import DegenerateAlignmentError
-from smust3r_colmap.evaluation import Evaluation, compare_trajectories
+from smust3r_colmap.evaluation.trajectory import Evaluation, compare_trajectories
 from smust3r_colmap.validation.description import FloatArray, Images, Subject, TransformsFile, TransformsFrame
 from smust3r_colmap.validation.rules import Evidence, Severity, measured, offenders, rule
 from smust3r_colmap.validation.transforms_file import INTRINSICS

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from smust3r_colmap.errors import StorageError
-from smust3r_colmap.execution import TaskFailure, map_tasks
+from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks
 from smust3r_colmap.validation import (
     binary_files,
     checks_cameras,

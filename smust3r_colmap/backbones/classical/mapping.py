@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from smust3r_colmap.backbones.classical.features import Pair, open_database, write_images
+from smust3r_colmap.features.sift import Pair, open_database, write_images
 from smust3r_colmap.backbones.classical.mapped_model import (
     MappedModel,
     connected_groups,

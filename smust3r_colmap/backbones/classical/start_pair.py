@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from smust3r_colmap.backbones.classical.features import Pair
+from smust3r_colmap.features.sift import Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.so3 import nearest_rotation
 

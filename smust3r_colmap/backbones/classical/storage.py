@@ -9,7 +9,7 @@ from smust3r_colmap.backbones.classical.mapped_model import MappedModel
 from smust3r_colmap.backbones.classical.mapping import MappedSegment
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import Tracks, UnregisteredImage
-from smust3r_colmap.run_directory import read_arrays, read_json, write_arrays, write_json
+from smust3r_colmap.storage.run_directory import read_arrays, read_json, write_arrays, write_json
 
 _FACTS = "segment.json"
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.alignment.irls import CAUCHY_TUNING, MAD_TO_SIGMA, TRIMMING_ROUNDS
+from smust3r_colmap.estimators.sim3 import CAUCHY_TUNING, MAD_TO_SIGMA, TRIMMING_ROUNDS
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.so3 import skew

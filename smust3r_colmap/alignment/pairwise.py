@@ -1,0 +1,361 @@
+"""Every edge between the pieces of a run, and the tests that keep broken ones out of the chain.
+
+Two pieces that share images are joined twice (paper section III-E): by the points that both saw,
+as feature tracks (as exact as dense pixels at a twentieth of the cost) or else as pointmaps, and by
+the cameras of the shared images. Pieces that share too few images are joined by verified matches
+between their images. The next module to read is ``chaining``.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from smust3r_colmap.alignment.from_pointmaps import align_pointmaps
+from smust3r_colmap.alignment.from_poses import align_poses
+from smust3r_colmap.alignment.from_tracks import align_tracks, match_links, point_depths
+from smust3r_colmap.estimators.sim3 import PieceFit, evenly_chosen
+from smust3r_colmap.alignment.uncertainty import honest_information, overlap_centre
+from smust3r_colmap.config import AlignmentConfig
+from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.geometry.groups import GROUPS, embed
+from smust3r_colmap.geometry.so3 import angles_between
+from smust3r_colmap.geometry.transform import Transform
+from smust3r_colmap.products import (
+    DenseMaps,
+    FeatureLinks,
+    SegmentAlignment,
+    SegmentPiece,
+    TransformEstimate,
+)
+
+logger = logging.getLogger(__name__)
+
+MAX_RELATIVE_RESIDUAL = 0.05
+"""Median residual over depth; sound edges have 0.0003 to 0.046, broken ones 0.15 to 0.76
+(measured on six real sets)."""
+MIN_SHARED_TRACKS = 30
+"""Fewer common points than COLMAP wants for one image do not carry a segment."""
+MIN_LINK_INLIERS = 12
+"""Inliers of an edge that rests on matches between images; a Sim(3) needs 3."""
+MIN_LINK_SHARE = 0.3
+"""Share of the linked points that must fit; wrong matches agree on nothing."""
+MIN_POSE_SHARE = 0.3
+"""Share of the shared cameras that must fit, centre and orientation; a broken pair had 3 of 14."""
+MAX_DISAGREEMENT_SIGMAS = 5.0
+"""Between the edge from points and the one from cameras, per degree of freedom."""
+DEPTH_IMAGES = 8
+"""Maps looked at for the median depth of a piece."""
+MAX_CAMERA_TURN_DEG = 10.0
+"""Median difference in rotation of the shared cameras after the fit; sound edges have 0.1 to 1.8."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TriedAlignment:
+    """Two pieces for which no transform was found, and why."""
+
+    target: int
+    source: int
+    evidence: str
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Edges:
+    """All alignments of a run, accepted or not, and the pairs that gave none."""
+
+    alignments: tuple[SegmentAlignment, ...]
+    failures: tuple[TriedAlignment, ...]
+
+
+def align_pieces(
+    pieces: Sequence[SegmentPiece],
+    dense: Sequence[DenseMaps],
+    links: FeatureLinks | None,
+    settings: AlignmentConfig,
+    *,
+    loop_segments: Collection[int] = (),
+    seed: int,
+    advance: Callable[[int], None],
+) -> Edges:
+    """Align every pair of pieces that could have something in common.
+
+    A pair gives up to two edges (paper section III-E): one from the points that both see, one from
+    the cameras of the images that both hold. Where both are sound but deny each other, the one from
+    points stays, since it rests on more.
+
+    Args:
+        pieces: all of the run. dense: their maps, in the same order.
+        links: verified matches, for pieces that share too few images; None where there are none.
+        settings: group, kinds of edges, source of correspondences, kernel, weighting.
+        loop_segments: indices of the segments that are loops, not windows of the sequence.
+        seed: of the searches for a robust start.
+        advance: called with 1 after each pair of ``candidate_pairs``.
+    """
+    aligner = _Aligner(pieces=pieces, dense=dense, links=links, settings=settings, seed=seed)
+    outcomes: list[SegmentAlignment | TriedAlignment] = []
+    for target, source in candidate_pairs(pieces, loop_segments):
+        outcomes += aligner.align(target, source)
+        advance(1)
+    return Edges(
+        alignments=tuple(one for one in outcomes if isinstance(one, SegmentAlignment)),
+        failures=tuple(one for one in outcomes if isinstance(one, TriedAlignment)),
+    )
+
+
+def needs_maps(pieces: Sequence[SegmentPiece], settings: AlignmentConfig) -> bool:
+    """Whether any pair may be aligned by its pointmaps."""
+    return settings.alignment_source == "pointmaps" or (
+        settings.alignment_source == "auto" and any(piece.tracks is None for piece in pieces)
+    )
+
+
+def candidate_pairs(pieces: Sequence[SegmentPiece], loop_segments: Collection[int] = ()) -> tuple[tuple[int, int], ...]:
+    """Pairs that share an image, or belong to the same or to neighbouring windows; never two loops."""
+    images = [set(piece.images) for piece in pieces]
+    is_loop = [piece.segment in loop_segments for piece in pieces]
+
+    def worth_it(a: int, b: int) -> bool:
+        if is_loop[a] and is_loop[b]:
+            return False
+        neighbours = not (is_loop[a] or is_loop[b]) and abs(pieces[a].segment - pieces[b].segment) <= 1
+        return neighbours or not images[a].isdisjoint(images[b])
+
+    return tuple((a, b) for a, b in combinations(range(len(pieces)), 2) if worth_it(a, b))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Aligner:
+    """All that aligning a pair of pieces needs."""
+
+    pieces: Sequence[SegmentPiece]
+    dense: Sequence[DenseMaps]
+    links: FeatureLinks | None
+    settings: AlignmentConfig
+    seed: int
+    _depths: dict[int, float] = field(default_factory=dict)
+
+    def align(self, target: int, source: int) -> list[SegmentAlignment | TriedAlignment]:
+        """Every edge between two pieces that was tried."""
+        outcomes: list[SegmentAlignment | TriedAlignment] = []
+        shared = bool(set(self.pieces[target].images) & set(self.pieces[source].images))
+        if self.settings.alignment_edges != "poses":
+            if shared:
+                outcomes.append(self._by_points(target, source))
+            if not any(_is_accepted(one) for one in outcomes) and self._has_links(target, source):
+                outcomes.append(self._by_links(target, source))
+        if shared and self.settings.alignment_edges != "points":
+            outcomes.append(self._by_poses(target, source, beside=tuple(outcomes)))
+        return outcomes
+
+    def _by_points(self, target: int, source: int) -> SegmentAlignment | TriedAlignment:
+        a, b = self.pieces[target], self.pieces[source]
+        evidence = _evidence(a, b, self.settings)
+        try:
+            if evidence == "tracks":
+                fit = align_tracks(a, b, self.settings, seed=self.seed)
+            else:
+                fit = align_pointmaps(a, b, self.dense[target], self.dense[source], self.settings, seed=self.seed)
+            return self._edge(target, source, fit, evidence, _refusal(a, b, fit))
+        except DegenerateAlignmentError as error:
+            return TriedAlignment(target=target, source=source, evidence=evidence, reason=str(error))
+
+    def _has_links(self, target: int, source: int) -> bool:
+        tracks = (self.pieces[target].tracks, self.pieces[source].tracks)
+        return self.links is not None and None not in tracks
+
+    def _by_links(self, target: int, source: int) -> SegmentAlignment | TriedAlignment:
+        assert self.links is not None
+        a, b = self.pieces[target], self.pieces[source]
+        try:
+            fit = _align_by_links(a, b, self.links, self.settings, self.seed)
+        except DegenerateAlignmentError as error:
+            return TriedAlignment(target=target, source=source, evidence="links", reason=str(error))
+        return self._edge(target, source, fit, "links", _refusal_of_links(a, b, fit))
+
+    def _by_poses(
+        self, target: int, source: int, *, beside: Sequence[SegmentAlignment | TriedAlignment]
+    ) -> SegmentAlignment | TriedAlignment:
+        a, b = self.pieces[target], self.pieces[source]
+        group: Literal["sim3", "se3"] = "se3" if self.settings.transform_group == "se3" else "sim3"
+        try:
+            fit = align_poses(a, b, depth_target=self._depth(target), kernel=self.settings.robust_kernel, group=group)
+            edge = self._edge(target, source, fit, "poses", _refusal_of_poses(a, b, fit))
+        except DegenerateAlignmentError as error:
+            return TriedAlignment(target=target, source=source, evidence="poses", reason=str(error))
+        return replace(edge, accepted=False, reason=reason) if (reason := _denied_by(edge, beside)) else edge
+
+    def _edge(self, target: int, source: int, fit: PieceFit, evidence: str, reason: str) -> SegmentAlignment:
+        """The fit with the uncertainty that a graph may believe, in the group of the run."""
+        b = self.pieces[source]
+        shared = set(self.pieces[target].images) & set(b.images)
+        group = GROUPS[self.settings.transform_group]
+        information = honest_information(
+            fit.estimate,
+            num_images=max(len(shared), 1),
+            centre_source=overlap_centre(b, shared or set(b.images), self._depth(source)),
+            depth_source=self._depth(source),
+            group=group,
+        )
+        return SegmentAlignment(
+            target=target,
+            source=source,
+            estimate=_in_group(fit.estimate, group),
+            evidence=evidence,
+            relative_residual=fit.relative_residual,
+            information=information,
+            accepted=not reason,
+            reason=reason,
+            fallback=fit.fallback,
+        )
+
+    def _depth(self, position: int) -> float:
+        """Median depth of a piece, measured once."""
+        if position not in self._depths:
+            piece = self.pieces[position]
+            self._depths[position] = median_depth(piece, self.dense[position] if piece.tracks is None else None)
+        return self._depths[position]
+
+
+def _in_group(estimate: TransformEstimate, group: type[Transform]) -> TransformEstimate:
+    """The same estimate as an element of a larger group, of which it knows nothing more."""
+    small = type(estimate.b_from_a)
+    if small is group:
+        return estimate
+    small_from_large = np.linalg.pinv(embed(group, small))
+    return replace(
+        estimate,
+        b_from_a=group.from_matrix(estimate.b_from_a.matrix),
+        information=small_from_large.T @ estimate.information @ small_from_large,
+    )
+
+
+def median_depth(piece: SegmentPiece, maps: DenseMaps | None) -> float:
+    """Median depth of what a piece sees, in its units: of its track points, else of some of its maps.
+
+    Raises:
+        DegenerateAlignmentError: there is no depth at all.
+    """
+    if piece.tracks is not None:
+        depths = point_depths(piece)
+    elif maps is None:
+        raise ValueError(f"piece {piece.name} has neither tracks nor maps")
+    else:
+        some = evenly_chosen(len(piece.images), DEPTH_IMAGES)
+        depths = np.concatenate([maps.depth(int(k))[::4, ::4].ravel() for k in some]).astype(np.float64)
+    known = depths[np.isfinite(depths) & (depths > 0)]
+    if not len(known):
+        raise DegenerateAlignmentError(f"piece {piece.name} has no depth anywhere")
+    return float(np.median(known))
+
+
+def _is_accepted(outcome: SegmentAlignment | TriedAlignment) -> bool:
+    return isinstance(outcome, SegmentAlignment) and outcome.accepted
+
+
+def _evidence(a: SegmentPiece, b: SegmentPiece, settings: AlignmentConfig) -> str:
+    if settings.alignment_source != "auto":
+        return settings.alignment_source
+    return "tracks" if a.tracks is not None and b.tracks is not None else "pointmaps"
+
+
+def _align_by_links(
+    a: SegmentPiece, b: SegmentPiece, links: FeatureLinks, settings: AlignmentConfig, seed: int
+) -> PieceFit:
+    """Matches run from the lower to the higher image; take them both ways."""
+    in_a, in_b = np.array(a.images), np.array(b.images)
+    forward = np.isin(links.image_a, in_a) & np.isin(links.image_b, in_b)
+    backward = np.isin(links.image_b, in_a) & np.isin(links.image_a, in_b)
+
+    def both(first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        return np.concatenate([first[forward], second[backward]])
+
+    return match_links(
+        a,
+        b,
+        settings,
+        image_a=both(links.image_a, links.image_b),
+        feature_a=both(links.feature_a, links.feature_b),
+        image_b=both(links.image_b, links.image_a),
+        feature_b=both(links.feature_b, links.feature_a),
+        seed=seed,
+    )
+
+
+def _refusal(a: SegmentPiece, b: SegmentPiece, fit: PieceFit) -> str:
+    """Why an edge from shared images cannot be believed, or nothing."""
+    if not fit.relative_residual <= MAX_RELATIVE_RESIDUAL:
+        return f"median residual is {fit.relative_residual:.3f} of the depth, at most {MAX_RELATIVE_RESIDUAL}"
+    if fit.num_correspondences < MIN_SHARED_TRACKS:
+        return f"{fit.num_correspondences} common points, needed {MIN_SHARED_TRACKS}"
+    return _camera_refusal(a, b, fit)
+
+
+def _camera_refusal(a: SegmentPiece, b: SegmentPiece, fit: PieceFit) -> str:
+    if not set(a.images) & set(b.images):
+        return ""
+    turn_deg = camera_turn_deg(a, b, fit)
+    if not turn_deg <= MAX_CAMERA_TURN_DEG:
+        return f"shared cameras differ by {turn_deg:.1f} degrees after the fit, at most {MAX_CAMERA_TURN_DEG}"
+    return ""
+
+
+def _refusal_of_links(a: SegmentPiece, b: SegmentPiece, fit: PieceFit) -> str:
+    """The same for an edge from matches; cameras that are shared all the same have to agree."""
+    if fit.estimate.num_inliers < MIN_LINK_INLIERS:
+        return f"{fit.estimate.num_inliers} matched points fit, needed {MIN_LINK_INLIERS}"
+    if fit.inlier_share < MIN_LINK_SHARE:
+        return f"{fit.inlier_share:.0%} of the matched points fit, needed {MIN_LINK_SHARE:.0%}"
+    return _camera_refusal(a, b, fit)
+
+
+def _refusal_of_poses(a: SegmentPiece, b: SegmentPiece, fit: PieceFit) -> str:
+    """The same for an edge from cameras."""
+    if not fit.relative_residual <= MAX_RELATIVE_RESIDUAL:
+        return f"the centres differ by {fit.relative_residual:.3f} of the depth, at most {MAX_RELATIVE_RESIDUAL}"
+    if fit.inlier_share < MIN_POSE_SHARE:
+        return f"{fit.inlier_share:.0%} of {fit.num_correspondences} cameras fit, needed {MIN_POSE_SHARE:.0%}"
+    return _camera_refusal(a, b, fit)
+
+
+def _denied_by(edge: SegmentAlignment, beside: Sequence[SegmentAlignment | TriedAlignment]) -> str:
+    """Why an edge from cameras falls before those from points, or nothing."""
+    if not edge.accepted:
+        return ""
+    sound = [one for one in beside if isinstance(one, SegmentAlignment) and one.accepted]
+    if not sound and any(isinstance(one, SegmentAlignment) for one in beside):
+        return "the points of the same images were refused"
+    for other in sound:
+        distance = disagreement_sigmas(edge, other)
+        if distance > MAX_DISAGREEMENT_SIGMAS:
+            return f"it denies the edge from {other.evidence}: {distance:.1f} standard deviations apart"
+    return ""
+
+
+def disagreement_sigmas(first: SegmentAlignment, second: SegmentAlignment) -> float:
+    """How far apart two edges between the same pieces are, per degree of freedom, in standard deviations.
+
+    Infinite where the difference is a stretched half turn, which has no logarithm.
+    """
+    between = first.estimate.b_from_a.inverse() @ second.estimate.b_from_a
+    if not between.log_exists():
+        return float("inf")
+    difference = between.log()
+    # The inverse of the sum of both covariances, also where one of them says nothing about a direction.
+    both = first.information @ np.linalg.pinv(first.information + second.information) @ second.information
+    return float(np.sqrt(difference @ both @ difference / len(difference)))
+
+
+def camera_turn_deg(a: SegmentPiece, b: SegmentPiece, fit: PieceFit) -> float:
+    """Median angle in degrees between the cameras of the shared images after the fit."""
+    shared = sorted(set(a.images) & set(b.images))
+    poses_a = a.seg_from_cam[[a.images.index(image) for image in shared]]
+    poses_b = b.seg_from_cam[[b.images.index(image) for image in shared]]
+    moved = fit.estimate.b_from_a.move_cameras(poses_b)
+    return float(np.degrees(np.median(angles_between(poses_a[..., :3], moved[..., :3]))))

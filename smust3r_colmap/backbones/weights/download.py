@@ -1,0 +1,304 @@
+"""Fetching one large file so that no byte comes twice when the line breaks.
+
+The bytes go to ``NAME.part``. Beside it ``NAME.part.json`` has the length of the whole file and what
+the server calls this version of it (an ETag or a date), so that the rest is asked for with Range and
+If-Range (RFC 9110, sections 13.1.5 and 14.2): a server whose file has changed sends the new one whole,
+and so does one that cannot send a part. ``NAME`` appears when all bytes are there and their sum is right.
+
+Proxies are taken from the environment, as by any program that uses ``urllib``.
+"""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import re
+import shutil
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from http import HTTPStatus
+from http.client import HTTPResponse
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from smust3r_colmap import __version__
+from smust3r_colmap.errors import DownloadError
+from smust3r_colmap.execution.progress import Reporter
+from smust3r_colmap.backbones.weights.cache import CACHE_VARIABLE, part_of
+from smust3r_colmap.backbones.weights.checksum import md5_of
+
+_MIB = 2**20
+
+# Ways out, for messages.
+_OTHER_DISK = f"make room, or name a folder on another disk in the environment variable {CACHE_VARIABLE}"
+_BY_HAND = "get the file by other means, say a browser, and name it with --weights"
+
+
+def download(
+    address: str, target: Path, *, md5: str, reporter: Reporter, timeout_s: float = 30.0, pause_s: float = 2.0
+) -> None:
+    """Fetch ``address`` into ``target``, going on where an earlier call was broken off.
+
+    Args:
+        address: http or https.
+        target: replaced if it exists; its folder is made.
+        md5: sum that the whole file must have.
+        reporter: hears of progress in MiB, and of what goes wrong on the way.
+        timeout_s: without a sign from the server for this long, the connection counts as broken.
+        pause_s: wait before a broken connection, if it brought anything, is tried again.
+
+    Raises:
+        DownloadError: another process fetches the same file; the server refuses; there is no
+            connection, or it breaks and trying again brings nothing; the disk is full or refuses;
+            the sum is wrong (then, and only then, what has come is thrown away).
+    """
+    part = _Part(part_of(target))
+    with _only_process(target):
+        _fetch_whole(address, part, reporter, timeout_s=timeout_s, pause_s=pause_s)
+        reporter.note(f"checking {target.name}")
+        found = md5_of(part.path)
+        if found != md5:
+            part.remove()
+            raise DownloadError(
+                f"{address}: what came has MD5 {found}, published is {md5}; it was removed. The same command fetches "
+                "it again; if that ends the same way, the file there is another one"
+            )
+        with _disk_errors(target):
+            os.replace(part.path, target)
+        part.remove()
+
+
+class _ConnectionBrokenError(Exception):
+    """The network failed, for the reason in the text; trying again may help."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Version:
+    """What tells the whole file from another one at the same address.
+
+    Args:
+        num_bytes: of the whole file.
+        validator: strong ETag, else the date of the last change, else empty.
+    """
+
+    num_bytes: int
+    validator: str
+
+    def may_be(self, other: _Version) -> bool:
+        """Nothing speaks against them being the same."""
+        validators = {self.validator, other.validator} - {""}
+        return self.num_bytes == other.num_bytes and len(validators) <= 1
+
+
+class _Part:
+    """The bytes that have come so far, and the version of the file that they are of."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._version_path = path.with_name(f"{path.name}.json")
+
+    @property
+    def version(self) -> _Version | None:
+        """None where nothing was begun, or where what was noted down cannot be read."""
+        try:
+            return _Version(**json.loads(self._version_path.read_text(encoding="utf-8")))
+        except (OSError, ValueError, TypeError):
+            return None
+
+    @property
+    def num_bytes(self) -> int:
+        """Bytes to go on from; those of an unknown version are of no use."""
+        return self.path.stat().st_size if self.version and self.path.is_file() else 0
+
+    @property
+    def is_whole(self) -> bool:
+        """All bytes are there."""
+        version = self.version
+        return version is not None and self.num_bytes == version.num_bytes
+
+    def begin(self, version: _Version) -> None:
+        """Empty, of a version; in this order, so that old bytes never pass for those of a new version."""
+        with _disk_errors(self.path):
+            self.path.write_bytes(b"")
+            self._version_path.write_text(json.dumps(asdict(version)), encoding="utf-8")
+
+    def remove(self) -> None:
+        """As if nothing had come."""
+        with _disk_errors(self.path):
+            self.path.unlink(missing_ok=True)
+            self._version_path.unlink(missing_ok=True)
+
+    def headers_to_go_on(self) -> dict[str, str]:
+        """Ask for the rest, on condition that the version is still the same; nothing when there is no part."""
+        version, num_bytes = self.version, self.num_bytes
+        if version is None or num_bytes == 0:
+            return {}
+        condition = {"If-Range": version.validator} if version.validator else {}
+        return {"Range": f"bytes={num_bytes}-", **condition}
+
+
+def _fetch_whole(address: str, part: _Part, reporter: Reporter, *, timeout_s: float, pause_s: float) -> None:
+    """Fetch until all is there; a broken connection is tried again for as long as that brings more bytes."""
+    while not part.is_whole:
+        had = part.num_bytes
+        try:
+            _fetch_rest(address, part, reporter, timeout_s=timeout_s)
+        except _ConnectionBrokenError as broken:
+            if part.num_bytes <= had:
+                kept = f"; the {had / _MIB:.1f} MiB that have come are kept, the same command goes on there"
+                raise DownloadError(
+                    f"{address}: {broken}; check the network, the proxy variables (http_proxy, https_proxy) and "
+                    f"--base-url, or get the file elsewhere and name it with --weights{kept if had else ''}"
+                ) from broken
+            reporter.warn(f"{address}: {broken}; trying again")
+            time.sleep(pause_s)
+
+
+def _fetch_rest(address: str, part: _Part, reporter: Reporter, *, timeout_s: float) -> None:
+    """One request: append to the part what is missing, or begin it anew if the server has another file."""
+    had, known = part.num_bytes, part.version
+    with _answer(address, part, timeout_s) as response:
+        first_byte, version = _span(address, response)
+        if first_byte not in (0, had):
+            raise DownloadError(
+                f"{address}: asked for the bytes from {had} on, the server sends those from {first_byte} on; {_BY_HAND}"
+            )
+        if first_byte == 0 or known is None or not known.may_be(version):
+            if had:
+                reporter.note(f"{address}: has changed, or comes only as a whole; starting over")
+            part.begin(version)
+        # The rest of another version is of no use: the part is empty now, and the next request is for everything.
+        if first_byte == part.num_bytes:
+            _append(response, part, version, reporter)
+
+
+def _answer(address: str, part: _Part, timeout_s: float) -> HTTPResponse:
+    """What the server says to the request for what is missing: status 200 (everything) or 206 (the rest)."""
+    headers = {"User-Agent": f"smust3r-colmap/{__version__}", **part.headers_to_go_on()}
+    request = urllib.request.Request(address, headers=headers)
+    try:
+        response: HTTPResponse = urllib.request.urlopen(request, timeout=timeout_s)
+    except urllib.error.HTTPError as error:
+        error.close()
+        if error.code == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and part.num_bytes:
+            part.remove()  # the file there is shorter now
+            return _answer(address, part, timeout_s)
+        raise DownloadError(
+            f"{address}: the server answers {error.code} {error.reason}; {_advice(error.code)}"
+        ) from error
+    except (OSError, http.client.HTTPException) as error:
+        raise _ConnectionBrokenError(f"no connection ({_cause(error)})") from error
+    return response
+
+
+def _span(address: str, response: HTTPResponse) -> tuple[int, _Version]:
+    """Where the bytes that follow begin in the file, and the version of the file.
+
+    Raises:
+        DownloadError: it is a page for people, as networks send that want a log-in first, or the server
+            does not say how long the file is.
+    """
+    if response.headers.get_content_type() == "text/html":
+        raise DownloadError(f"{address}: what comes is a web page (a log-in of the network?); {_BY_HAND}")
+    if response.status == HTTPStatus.PARTIAL_CONTENT:
+        match = re.fullmatch(r"bytes (\d+)-\d+/(\d+)", response.headers.get("Content-Range", ""))
+        first_byte, num_bytes = (int(match[1]), int(match[2])) if match else (0, 0)
+    else:
+        first_byte, num_bytes = 0, response.length or 0
+    if num_bytes == 0:
+        raise DownloadError(f"{address}: the server does not say how long the file is; {_BY_HAND}")
+    tag = response.headers.get("ETag", "")
+    # If-Range does not take weak tags: they call files equal whose bytes differ.
+    validator = response.headers.get("Last-Modified", "") if not tag or tag.startswith("W/") else tag
+    return first_byte, _Version(num_bytes=num_bytes, validator=validator)
+
+
+def _append(response: HTTPResponse, part: _Part, version: _Version, reporter: Reporter) -> None:
+    """Write the bytes of the response behind those of the part, telling of each MiB."""
+    done = part.num_bytes
+    _check_space(part.path, missing=version.num_bytes - done)
+    total_mib = -(-version.num_bytes // _MIB)
+    name = part.path.with_suffix("").name
+    with (
+        reporter.stage(f"{name}, MiB", total=total_mib) as stage,
+        _disk_errors(part.path),
+        part.path.open("ab") as file,
+    ):
+        done_mib = done // _MIB
+        stage.skip(done_mib)
+        while done < version.num_bytes:
+            block = _read(response, at_most=min(_MIB, version.num_bytes - done))
+            file.write(block)
+            done += len(block)
+            now_mib = total_mib if done == version.num_bytes else done // _MIB
+            stage.advance(now_mib - done_mib)
+            done_mib = now_mib
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _read(response: HTTPResponse, *, at_most: int) -> bytes:
+    """The next bytes, as they come."""
+    try:
+        block = response.read1(at_most)
+    except (OSError, http.client.HTTPException) as error:
+        raise _ConnectionBrokenError(f"the connection broke ({_cause(error)})") from error
+    if not block:
+        raise _ConnectionBrokenError("the connection ended before the file did")
+    return block
+
+
+def _check_space(path: Path, *, missing: int) -> None:
+    with _disk_errors(path):
+        free = shutil.disk_usage(path.parent).free
+    if missing > free:
+        raise DownloadError(
+            f"{path.parent}: {missing / _MIB:.1f} MiB are missing and the disk has {free / _MIB:.1f} MiB free; "
+            f"{_OTHER_DISK}"
+        )
+
+
+@contextmanager
+def _only_process(target: Path) -> Iterator[None]:
+    """Hold the file's lock, or refuse."""
+    lock = FileLock(target.with_name(f".{target.name}.lock"))
+    with _disk_errors(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            raise DownloadError(f"{target}: another process is fetching it; wait for it or stop it") from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@contextmanager
+def _disk_errors(path: Path) -> Iterator[None]:
+    """Turn what the disk refuses into a DownloadError with the way out."""
+    try:
+        yield
+    except OSError as error:
+        raise DownloadError(f"{path}: {error.strerror or error}; what has come is kept; {_OTHER_DISK}") from error
+
+
+def _advice(status: int) -> str:
+    """What to do about an answer that is a refusal."""
+    if status in (HTTPStatus.NOT_FOUND, HTTPStatus.GONE):
+        return f"check --base-url, or {_BY_HAND}"
+    if status == HTTPStatus.TOO_MANY_REQUESTS or status >= HTTPStatus.INTERNAL_SERVER_ERROR:
+        return "what has come is kept, try again later"
+    return f"the server or a proxy does not let this program in: {_BY_HAND}"
+
+
+def _cause(error: Exception) -> str:
+    """The reason in words; urllib wraps it, and some have none."""
+    reason = getattr(error, "reason", error)
+    return str(reason) or type(reason).__name__

@@ -1,0 +1,1 @@
+"""Everything that touches COLMAP's files and objects: databases, model files, reconstructions."""

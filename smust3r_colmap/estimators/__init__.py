@@ -1,0 +1,1 @@
+"""Robust fits that know nothing of segments: similarity, affine and projective transforms, weights, scales."""

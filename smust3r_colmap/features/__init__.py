@@ -1,0 +1,1 @@
+"""Features, image pairs and matches of the whole run."""

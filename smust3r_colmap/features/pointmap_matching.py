@@ -1,0 +1,851 @@
+"""Tracks without features: corners carried from image to image by depth and cameras, then placed by the pixels.
+
+Depth maps and stitched cameras are right to some pixels. A match that repeats them teaches a bundle
+adjustment nothing, so they only say where to look, at what warp and with what right: a corner is carried
+over where both images' depths agree on its surface, and is then laid on the other image by its patch. What
+that image contradicts is dropped.
+
+A track is one corner. Where it was detected it has no error, everywhere else it is what was laid on it, and
+what was found once is carried on to the next images rather than detected again: that makes tracks long.
+Coordinates are pixels of the grey image until they are returned. The next module to read is ``adjustment``.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+from scipy.spatial import cKDTree
+
+from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.features.correspondences import Correspondences, Pair
+
+logger = logging.getLogger(__name__)
+
+FloatArray = npt.NDArray[np.float64]
+Float32Array = npt.NDArray[np.float32]
+ByteArray = npt.NDArray[np.uint8]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+CACHED_VIEWS = 32
+"""Images in memory at a time, at 4/3 bytes a pixel; more than an image has partners as a rule, so that going
+through a sequence reads each image once."""
+CANDIDATES = 4
+"""Corners that are looked at per corner wanted, for some lie on no surface."""
+ARRIVALS = 2
+"""Times the corners of its own that an image may have, with what later images find in it."""
+MOST_KEYPOINTS = 16_000
+"""That an image may be given; OpenCV's remap takes twice that many patches at once and no more."""
+MOST_PIXELS = 32_766
+"""Along a side of a grey image, for the same reason."""
+WIDE_REACH = 0.04
+"""How far from where the stitched cameras put a corner it is looked for, as a part of the longer side: 26 px of
+640. Two cameras 5 cm and half a degree apart from where they should be move what is 2 m away by 20."""
+NEAR_REACH = 0.01
+"""The same once the two images have agreed on how they stand to each other; what is left comes from depth."""
+SAMPLE = 200
+"""Corners that an agreement is made of."""
+MIN_AGREEING = 15
+"""Corners that must support it; COLMAP wants as many inliers of a pair."""
+MIN_AGREEING_SHARE = 0.4
+"""Of the corners that were found: look-alike surfaces correlate here and there, but to no common motion."""
+PATCH_RADIUS = 6
+"""13 x 13 pixels: a corner with some surroundings, and still flat on most surfaces."""
+CORNER_BLOCK = 5
+"""Side of the window whose gradients make a corner."""
+CORNER_DISTANCE = 4
+"""Pixels that two corners of an image are apart at least; nearer ones share most of their patch."""
+MIN_GRADIENT = 2.0
+"""Grey levels per pixel (rms over the window) along the weaker direction of a corner. Noise and JPEG make about
+one; from two on, a patch is placed to a tenth of a pixel."""
+MERGE_PX = 0.75
+"""What is found nearer than this to a keypoint is that keypoint."""
+SIGMAS = 3.0
+"""Robust standard deviations over a pair that its depths, and its matches from where depth puts them, may be off."""
+LEAST_MISS_PX = 1.5
+"""Lower bound of the latter: matches of a pair that is exact are not cut to the width of its rounding."""
+DEPTH_TOLERANCE = (0.02, 0.1)
+"""Bounds of the former, relative: a pair of exact maps still has rounding at slanted surfaces, and where
+most of a pair disagrees its deviation says nothing."""
+SURFACE_SAMPLES = 5
+"""Along each side of a patch that a plane is fitted to: 25 make its slope good enough for a warp."""
+ROUND_TRIP_MAP_PX = 1.5
+"""Pixels of the depth map by which the way there and back may miss its start: what reading depth at
+neighbouring pixels can differ by."""
+SURFACE_JUMP = 0.05
+"""Inverse depths that differ by more than this part belong to another surface."""
+SURFACE_SHARE = 0.6
+"""Of the pixels round a corner that must lie on its surface. Less is an outline, whose background moves."""
+CAPTURE_PX = 4.0
+"""From how far the alignment of a patch finds home at one level of the pyramid."""
+MAX_STRETCH = 2.5
+"""Of a patch between two images, in any direction, and its reciprocal; beyond, one has details the other lacks."""
+MIN_CORRELATION = 0.8
+"""Normalised, of two patches that show the same."""
+ITERATIONS = 8
+"""Of the alignment at each level of the pyramid."""
+CONVERGED_PX = 0.02
+"""A patch stops where its step is shorter; one that still makes five times as long ones has not settled."""
+LEAST_TEXTURE = 1e-6
+"""Determinant, of the squared gradients of a patch of length one; below it the patch has one direction at most."""
+
+
+# -------------------------------------------------------------------------------- input
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MappedView:
+    """An image with its camera and what reads its pixels and its depth.
+
+    The three arrays cover the whole (distorted) image, each uniformly resized; corners are located in
+    the grey one, so its size is the caller's choice of exactness against time.
+
+    Args:
+        index: of the image in the collection.
+        cam_from_world: (3, 4) rigid.
+        intrinsics: at the size that keypoints are wanted in, in any camera model.
+        depth: reads (h, w) z-depth in units of the world; 0, negative or not finite where there is none.
+        confidence: reads (h, w), at least 1.
+        grey: reads (H, W) uint8.
+
+    Raises:
+        ValueError: the pose is not (3, 4) and finite.
+    """
+
+    index: int
+    cam_from_world: FloatArray
+    intrinsics: Intrinsics
+    depth: Callable[[], Float32Array]
+    confidence: Callable[[], Float32Array]
+    grey: Callable[[], ByteArray]
+
+    def __post_init__(self) -> None:
+        if self.cam_from_world.shape != (3, 4) or not np.isfinite(self.cam_from_world).all():
+            raise ValueError(f"MappedView {self.index}: pose {self.cam_from_world.shape}, needed (3, 4), finite")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Camera:
+    """Where a view stands and how it projects, at the size of its grey image."""
+
+    cam_from_world: FloatArray  # (3, 4)
+    intrinsics: Intrinsics
+
+    def reach_px(self, share: float) -> float:
+        """A part of the longer side."""
+        return share * max(self.intrinsics.width, self.intrinsics.height)
+
+    def xy_img(self, points_world: FloatArray) -> FloatArray:
+        """(K, 2) of points (K, 3); NaN behind the camera."""
+        return self.intrinsics.xy_img(points_world @ self.cam_from_world[:, :3].T + self.cam_from_world[:, 3])
+
+    def points_world(self, xy_img: FloatArray, inverse_depth: FloatArray) -> FloatArray:
+        """(K, 3) of pixels (K, 2) at the inverse depths (K,); NaN where either is."""
+        points_cam = self.intrinsics.rays_cam(xy_img) / inverse_depth[:, None]
+        world_from_cam = invert_rigid(self.cam_from_world)
+        points: FloatArray = points_cam @ world_from_cam[:, :3].T + world_from_cam[:, 3]
+        return points
+
+    def depth(self, points_world: FloatArray) -> FloatArray:
+        """(K,) z of points (K, 3)."""
+        z: FloatArray = points_world @ self.cam_from_world[2, :3] + self.cam_from_world[2, 3]
+        return z
+
+    def sees(self, points_world: FloatArray, xy_img: FloatArray) -> BoolArray:
+        """(K,) whether points (K, 3) are seen at (K, 2), but for what most of them are off."""
+        return _usual(
+            np.linalg.norm(self.xy_img(points_world) - xy_img, axis=1), LEAST_MISS_PX, self.reach_px(NEAR_REACH)
+        )
+
+    def holds(self, xy_img: FloatArray) -> BoolArray:
+        """(K,) whether the patch at (K, 2) lies within the image; false where a coordinate is NaN."""
+        size = np.array([self.intrinsics.width, self.intrinsics.height])
+        margin = PATCH_RADIUS + 1
+        inside: BoolArray = np.all((xy_img >= margin) & (xy_img <= size - margin), axis=1)
+        return inside
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _View:
+    """A ``MappedView`` in memory.
+
+    Args:
+        index: of the image in the collection.
+        camera: at the size of the grey image.
+        pyramid: the grey image and its halves.
+        inverse_depth: (h, w) float32, NaN where there is no confident depth.
+    """
+
+    index: int
+    camera: _Camera
+    pyramid: tuple[ByteArray, ...]
+    inverse_depth: Float32Array
+
+    @property
+    def map_px_per_px(self) -> FloatArray:
+        """(2,) pixels of the depth map per pixel of the grey image, along x and y."""
+        height, width = self.inverse_depth.shape
+        return np.array([width / self.camera.intrinsics.width, height / self.camera.intrinsics.height])
+
+
+def _usual(sizes: FloatArray, least: float, most: float) -> BoolArray:
+    """(K,) which of the sizes of errors (K,) are within ``SIGMAS`` robust standard deviations, bounded both ways."""
+    finite = sizes[np.isfinite(sizes)]
+    sigma = 1.4826 * np.median(finite) if len(finite) else 0.0
+    return np.asarray(sizes <= np.clip(SIGMAS * sigma, least, most))
+
+
+def _read(view: MappedView, min_confidence: float) -> _View:
+    grey, depth, confidence = view.grey(), view.depth(), view.confidence()
+    if grey.ndim != 2 or grey.dtype != np.uint8:
+        raise ValueError(f"image {view.index}: grey is {grey.shape} {grey.dtype}, needed (H, W) uint8")
+    if max(grey.shape) > MOST_PIXELS:
+        raise ValueError(f"image {view.index}: grey is {grey.shape}, at most {MOST_PIXELS} a side; give it resized")
+    if depth.ndim != 2 or depth.shape != confidence.shape:
+        raise ValueError(
+            f"image {view.index}: depth is {depth.shape}, confidence {confidence.shape}, needed one (h, w)"
+        )
+    usable = np.isfinite(depth) & (depth > 0) & (confidence >= min_confidence)
+    height, width = grey.shape
+    camera = _Camera(cam_from_world=view.cam_from_world, intrinsics=view.intrinsics.resized(width, height))
+    pyramid = [grey]
+    while len(pyramid) < _levels(camera.reach_px(WIDE_REACH)) and min(pyramid[-1].shape) > 4 * PATCH_RADIUS:
+        pyramid.append(np.asarray(cv2.pyrDown(pyramid[-1]), dtype=np.uint8))
+    return _View(
+        index=view.index,
+        camera=camera,
+        pyramid=tuple(pyramid),
+        inverse_depth=np.where(usable, 1 / np.where(usable, depth, 1), np.nan).astype(np.float32),
+    )
+
+
+# ------------------------------------------------------------------------------ matching
+def match_by_pointmaps(
+    views: Sequence[MappedView], pairs: Sequence[Pair], *, max_keypoints: int, min_confidence: float = 2.0
+) -> Correspondences:
+    """Mutual, depth-consistent correspondences between images, located by their pixels.
+
+    Images are gone through in order. Each gets corners where it has no keypoint yet, and all its keypoints
+    are looked for in every image that it forms a pair with and that has not got them:
+
+    - how the two images stand to each other is agreed first, within ``WIDE_REACH`` of what the stitched cameras
+      say (``_agreed_camera``); a pair that does not agree gets no matches;
+    - depth says where: the other image must have the same depth there, within ``SIGMAS`` deviations of the
+      pair and ``DEPTH_TOLERANCE``, and its own depth must lead back to within ``ROUND_TRIP_MAP_PX``;
+    - the patch, warped by the surface's slope, is laid on the other image (``align_patches``); it must correlate by
+      ``MIN_CORRELATION``, and lie where depth put it as nearly as most of the pair do and within ``NEAR_REACH``;
+    - what comes within ``MERGE_PX`` of a keypoint is that keypoint, and two tracks become one.
+
+    In the end a pair is matched wherever both images have a keypoint of one track, and each image's depth puts
+    it where the other has it; a keypoint is matched once at most. At most ``CACHED_VIEWS`` images are in memory.
+
+    Args:
+        views: images by distinct index.
+        pairs: (i, j) of image indices with i < j; only these are compared and matched. Repeats count once.
+        max_keypoints: with which an image begins; others may find as many again in it.
+        min_confidence: of depth that is used; 1 is none.
+
+    Returns:
+        Keypoints of all views, without those that match nothing, and matches of the pairs that have any.
+
+    Raises:
+        ValueError: two views have one index, a pair is not ascending or names no view, ``max_keypoints`` is not
+            within 1 to ``MOST_KEYPOINTS``, or what a loader gives has another shape or type than stated.
+    """
+    view_of = _by_index(views, pairs, max_keypoints)
+    partners = defaultdict(set)
+    for i, j in pairs:
+        partners[i].add(j)
+        partners[j].add(i)
+    read = lru_cache(maxsize=CACHED_VIEWS)(lambda index: _read(view_of[index], min_confidence))
+    tracks = _Tracks(ARRIVALS * max_keypoints)
+    px_per_grey_px = {index: np.ones(2) for index in view_of}
+    for i in sorted(partners):
+        view = read(i)
+        px_per_grey_px[i] = np.divide(_size(view_of[i].intrinsics), _size(view.camera.intrinsics))
+        tracks.start(view, _new_corners(view, tracks.of(i).xy, max_keypoints))
+        for j in sorted(partners[i]):
+            _carry_over(tracks, view, read(j))
+    found = _correspondences(tracks, px_per_grey_px, sorted(set(pairs)))
+    logger.info("%d matches of %d pairs by pointmaps", found.num_matches, len(found.matches))
+    return found
+
+
+def _by_index(views: Sequence[MappedView], pairs: Sequence[Pair], max_keypoints: int) -> dict[int, MappedView]:
+    view_of = {view.index: view for view in views}
+    if len(view_of) != len(views):
+        raise ValueError(f"match_by_pointmaps: {len(views)} views have {len(view_of)} indices")
+    for i, j in pairs:
+        if not i < j or i not in view_of or j not in view_of:
+            raise ValueError(f"match_by_pointmaps: pair ({i}, {j}) is not ascending or names no view")
+    if not 1 <= max_keypoints <= MOST_KEYPOINTS:
+        raise ValueError(f"match_by_pointmaps: max_keypoints is {max_keypoints}, needed 1 to {MOST_KEYPOINTS}")
+    return view_of
+
+
+def _size(intrinsics: Intrinsics) -> tuple[int, int]:
+    return intrinsics.width, intrinsics.height
+
+
+def _correspondences(
+    tracks: _Tracks, px_per_grey_px: Mapping[int, FloatArray], pairs: Sequence[Pair]
+) -> Correspondences:
+    """What is matched, with the keypoints that are, numbered anew and at the size of the intrinsics."""
+    matches = {(i, j): tracks.matched(i, j) for i, j in pairs}
+    matches = {pair: rows for pair, rows in matches.items() if len(rows)}
+    used = {index: np.zeros(len(tracks.of(index)), dtype=bool) for index in px_per_grey_px}
+    for pair, rows in matches.items():
+        for index, column in zip(pair, rows.T, strict=True):
+            used[index][column] = True
+    new_row = {index: np.cumsum(flags) - 1 for index, flags in used.items()}
+    return Correspondences(
+        keypoints={
+            index: (tracks.of(index).xy[flags] * px_per_grey_px[index]).astype(np.float32)
+            for index, flags in used.items()
+        },
+        matches={
+            (i, j): np.stack([new_row[i][rows[:, 0]], new_row[j][rows[:, 1]]], axis=1).astype(np.uint32)
+            for (i, j), rows in matches.items()
+        },
+    )
+
+
+# ------------------------------------------------------------------------------- corners
+def _new_corners(view: _View, known_xy: FloatArray, max_keypoints: int) -> FloatArray:
+    """(K, 2) centres of pixels that are corners on a surface, away from the keypoints (M, 2) that are there.
+
+    So many that the image has ``max_keypoints``, or all there are.
+    """
+    wanted = max(0, max_keypoints - len(known_xy))
+    strength = _corner_strength(view.pyramid[0])
+    around = np.ones((2 * CORNER_DISTANCE - 1, 2 * CORNER_DISTANCE - 1), np.uint8)
+    peaks = (strength >= np.maximum(cv2.dilate(strength, around), MIN_GRADIENT**2)).astype(np.uint8)
+    for x, y in known_xy:
+        cv2.circle(peaks, (int(x), int(y)), CORNER_DISTANCE, 0, thickness=-1)
+    rows, columns = np.nonzero(peaks)
+    xy: FloatArray = np.stack([columns, rows], axis=1).astype(np.float64) + 0.5
+    map_columns, map_rows = (xy * view.map_px_per_px).astype(np.int64).T
+    usable = view.camera.holds(xy) & np.isfinite(view.inverse_depth[map_rows, map_columns])
+    xy = xy[usable]
+
+    cell_side = np.sqrt(strength.size / max_keypoints)
+    spread = xy[_evenly_ordered(xy, strength[rows, columns][usable], known_xy, cell_side)[: CANDIDATES * wanted]]
+    chosen: FloatArray = spread[np.isfinite(_surface_at(view, spread).inverse_depth)][:wanted]
+    return chosen
+
+
+def _evenly_ordered(xy: FloatArray, strength: Float32Array, known_xy: FloatArray, cell_side: float) -> IntArray:
+    """(K,) the order in which to take points: the strongest of each empty square cell, then all seconds, and so on.
+
+    That spreads them evenly, and yet none is saved for a cell of sky.
+
+    Args:
+        xy: (K, 2). strength: (K,).
+        known_xy: (M, 2) points that are there already; their cells have had a turn for each.
+        cell_side: in pixels.
+    """
+    both = np.concatenate([known_xy, xy])
+    is_new = np.arange(len(both)) >= len(known_xy)
+    strengths = np.concatenate([np.zeros(len(known_xy)), strength])
+    cell = np.unique(both // cell_side, axis=0, return_inverse=True)[1].ravel()
+    by_cell = np.lexsort((-strengths, is_new, cell))
+    turn = np.empty(len(both), np.int64)
+    turn[by_cell] = np.arange(len(both)) - np.searchsorted(cell[by_cell], cell[by_cell])
+    return np.lexsort((-strength, turn[is_new]))
+
+
+def _corner_strength(grey: ByteArray) -> Float32Array:
+    """(H, W) mean squared gradient along the direction where it is smaller, in squared grey levels per pixel.
+
+    Source: Shi and Tomasi 1994, "Good Features to Track".
+    """
+    # OpenCV sums, not averages, and scales Sobel's derivative (8 per grey level per pixel) by 1 / (4 * block * 255).
+    per_unit = (4 * CORNER_BLOCK * 255 / 8) ** 2 / CORNER_BLOCK**2
+    return np.asarray(cv2.cornerMinEigenVal(grey, CORNER_BLOCK, ksize=3) * per_unit, dtype=np.float32)
+
+
+# ------------------------------------------------------------------------------ surfaces
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Surface:
+    """The plane at each of K pixels; NaN where there is none.
+
+    Args:
+        inverse_depth: (K,) at the pixel. slope: (K, 2) its change per pixel of the grey image.
+    """
+
+    inverse_depth: FloatArray
+    slope: FloatArray
+
+
+def _surface_at(view: _View, xy: FloatArray) -> _Surface:
+    """Planes fitted to the depth map under a patch, by least squares in inverse depth, which is linear on a plane.
+
+    Depth that jumps is another surface and left out; a pixel whose surroundings are mostly left out has none.
+    """
+    zoom = view.map_px_per_px
+    radius = max(2.0, PATCH_RADIUS * zoom.max())
+    along = np.round(np.linspace(-radius, radius, SURFACE_SAMPLES)).astype(np.int64)
+    window = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
+    xy_map = np.where(np.isfinite(xy), xy, -1e6) * zoom
+    pixels = np.floor(xy_map).astype(np.int64)[:, None] + window  # (K, P, 2)
+    height, width = view.inverse_depth.shape
+    inside = np.asarray(((pixels >= 0) & (pixels < (width, height))).all(axis=-1))
+    columns, rows = np.moveaxis(np.where(inside[..., None], pixels, 0), -1, 0)
+    values = np.where(inside, view.inverse_depth[rows, columns], np.nan)
+    middle = values[:, len(window) // 2, None]
+    same = np.asarray(np.abs(values - middle) < SURFACE_JUMP * middle)
+    enough = np.asarray(same.mean(axis=1) >= SURFACE_SHARE)
+
+    terms = np.concatenate([np.ones((*same.shape, 1)), pixels + 0.5 - xy_map[:, None]], axis=-1)[enough]
+    weighted = terms * same[enough, :, None]
+    normal = np.swapaxes(weighted, 1, 2) @ terms
+    right = np.swapaxes(weighted, 1, 2) @ np.where(same, values, 0)[enough, :, None]
+    plane = np.full((len(xy), 3), np.nan)
+    plane[enough] = np.linalg.solve(normal, right)[..., 0]
+    return _Surface(inverse_depth=plane[:, 0], slope=plane[:, 1:] * zoom)
+
+
+# -------------------------------------------------------------------------------- tracks
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Keypoints:
+    """Of one image, K of them.
+
+    Args:
+        xy: (K, 2) in the grey image.
+        points_world: (K, 3) by the image's own depth.
+        tangents_world: (K, 2, 3) how the point moves over the surface per pixel along x and y.
+        track: (K,) number of the track, before tracks were united.
+    """
+
+    xy: FloatArray
+    points_world: FloatArray
+    tangents_world: FloatArray
+    track: IntArray
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def taken(self, rows: IntArray | BoolArray) -> _Keypoints:
+        """Some rows."""
+        return _Keypoints(
+            xy=self.xy[rows],
+            points_world=self.points_world[rows],
+            tangents_world=self.tangents_world[rows],
+            track=self.track[rows],
+        )
+
+    def followed_by(self, more: _Keypoints) -> _Keypoints:
+        """These rows, then those."""
+        return _Keypoints(
+            xy=np.concatenate([self.xy, more.xy]),
+            points_world=np.concatenate([self.points_world, more.points_world]),
+            tangents_world=np.concatenate([self.tangents_world, more.tangents_world]),
+            track=np.concatenate([self.track, more.track]),
+        )
+
+
+_NO_KEYPOINTS = _Keypoints(
+    xy=np.empty((0, 2)),
+    points_world=np.empty((0, 3)),
+    tangents_world=np.empty((0, 2, 3)),
+    track=np.empty(0, np.int64),
+)
+
+
+def _keypoints_at(view: _View, xy: FloatArray, track: IntArray) -> _Keypoints:
+    """Keypoints on the view's own surface; NaN where it has none."""
+    surface = _surface_at(view, xy)
+    points = view.camera.points_world(xy, surface.inverse_depth)
+    beside = [view.camera.points_world(xy + step, surface.inverse_depth + surface.slope @ step) for step in np.eye(2)]
+    return _Keypoints(
+        xy=xy, points_world=points, tangents_world=np.stack(beside, axis=1) - points[:, None], track=track
+    )
+
+
+class _Tracks:
+    """Keypoints of all images while they grow. Tracks that turn out to be one are united (a disjoint-set forest)."""
+
+    def __init__(self, max_per_image: int) -> None:
+        self._max_per_image = max_per_image
+        self._keypoints: dict[int, _Keypoints] = {}
+        self._agreed: dict[Pair, _Camera] = {}
+        self._parent = np.empty(0, np.int64)
+
+    def of(self, image: int) -> _Keypoints:
+        """Keypoints of an image so far."""
+        return self._keypoints.get(image, _NO_KEYPOINTS)
+
+    def roots(self, image: int) -> IntArray:
+        """(K,) the track of each keypoint, unions included."""
+        roots = self.of(image).track
+        while True:
+            above = self._parent[roots]
+            if (above == roots).all():
+                return roots
+            roots = above
+
+    def start(self, view: _View, xy: FloatArray) -> None:
+        """New corners (K, 2) of an image, each a track of its own."""
+        tracks = len(self._parent) + np.arange(len(xy))
+        self._parent = np.concatenate([self._parent, tracks])
+        self.add(view, _keypoints_at(view, xy, tracks))
+
+    def add(self, view: _View, keypoints: _Keypoints) -> None:
+        """Append to the keypoints of an image those that lie on its surface, as long as there is room."""
+        known = self.of(view.index)
+        on_surface = np.flatnonzero(np.isfinite(keypoints.tangents_world).all(axis=(1, 2)))
+        room = self._max_per_image - len(known)
+        self._keypoints[view.index] = known.followed_by(keypoints.taken(on_surface[:room]))
+
+    def unite(self, track_a: IntArray, track_b: IntArray) -> None:
+        """Make one track of every two of (K,) tracks, unless they are one already."""
+        for a, b in zip(track_a, track_b, strict=True):
+            self._parent[self._root(a)] = self._root(b)
+
+    def _root(self, track: int) -> int:
+        while self._parent[track] != track:
+            track = int(self._parent[track])
+        return track
+
+    def missing(self, a: int, b: int) -> _Keypoints:
+        """Keypoints of image a whose track is not in image b."""
+        return self.of(a).taken(~np.isin(self.roots(a), self.roots(b)))
+
+    def shared(self, a: int, b: int) -> IntArray:
+        """(M, 2) rows of two images on one track, one to one."""
+        _, rows_a, rows_b = np.intersect1d(self.roots(a), self.roots(b), return_indices=True)
+        return np.stack([rows_a, rows_b], axis=1)
+
+    def agree(self, a: int, b: int, camera_b: _Camera) -> None:
+        """Note the camera of image b as image a sees it."""
+        self._agreed[a, b] = camera_b
+
+    def matched(self, i: int, j: int) -> IntArray:
+        """(M, 2) of the shared rows, those that lie where each image's depth puts them in the other."""
+        if (i, j) not in self._agreed or (j, i) not in self._agreed:
+            return np.empty((0, 2), np.int64)
+        rows = self.shared(i, j)
+        in_i, in_j = self.of(i).taken(rows[:, 0]), self.of(j).taken(rows[:, 1])
+        near_j = self._agreed[i, j].sees(in_i.points_world, in_j.xy)
+        near_i = self._agreed[j, i].sees(in_j.points_world, in_i.xy)
+        return rows[near_i & near_j]
+
+
+# ------------------------------------------------------------------------------ carrying
+def _carry_over(tracks: _Tracks, view_a: _View, view_b: _View) -> None:
+    """Find in image b what image a has and b has not yet, if the two agree on how they stand to each other."""
+    camera_b = _agreed_camera(tracks, view_a, view_b)
+    if camera_b is None:
+        logger.debug("images %d and %d show no common motion", view_a.index, view_b.index)
+        return
+    tracks.agree(view_a.index, view_b.index, camera_b)
+    in_a = tracks.missing(view_a.index, view_b.index)
+    carried = _carried(in_a, view_a, view_b, camera_b)
+    found = _found(in_a, carried.taken(carried.is_mutual), view_a, view_b, NEAR_REACH)
+    found = found.taken(camera_b.sees(in_a.points_world[found.rows], found.xy_b))
+    _attach(tracks, view_a, view_b, in_a, found)
+
+
+def _agreed_camera(tracks: _Tracks, view_a: _View, view_b: _View) -> _Camera | None:
+    """The camera of b as the points of a see it, for stitched cameras are right to some pixels only.
+
+    Where the images share enough tracks, these tell. Elsewhere a sample of corners is looked for in a wide
+    reach. None where too few of them have a motion in common: either the stitched geometry is not to be
+    believed here, or the images show nothing of each other.
+    """
+    if len(tracks.of(view_a.index)) < MIN_AGREEING:
+        return None
+    shared = tracks.shared(view_a.index, view_b.index)
+    points_world = tracks.of(view_a.index).points_world[shared[:, 0]]
+    xy_b = tracks.of(view_b.index).xy[shared[:, 1]]
+    if len(shared) < SAMPLE // 2:
+        in_a = tracks.missing(view_a.index, view_b.index)
+        carried = _carried(in_a, view_a, view_b, view_b.camera)
+        carried = carried.taken(carried.is_near)
+        found = _found(in_a, carried.taken(_spread(len(carried.rows), SAMPLE)), view_a, view_b, WIDE_REACH)
+        points_world = np.concatenate([points_world, in_a.points_world[found.rows]])
+        xy_b = np.concatenate([xy_b, found.xy_b])
+    few = _spread(len(xy_b), SAMPLE)
+    return _resected(view_b.camera, points_world[few], xy_b[few])
+
+
+def _spread(length: int, number: int) -> IntArray:
+    """At most so many of the positions below a length, evenly."""
+    return np.linspace(0, length - 1, min(number, length)).astype(np.int64)
+
+
+def _resected(camera: _Camera, points_world: FloatArray, xy_img: FloatArray) -> _Camera | None:
+    """The camera turned and moved to see points (K, 3) at (K, 2); None where too few of them agree."""
+    if len(xy_img) < MIN_AGREEING:
+        return None
+    ransac = {"max_error": camera.reach_px(NEAR_REACH), "max_num_trials": 1000, "random_seed": 0}
+    found = pycolmap.estimate_and_refine_absolute_pose(
+        xy_img,
+        points_world,
+        camera.intrinsics.colmap_camera(),
+        estimation_options=pycolmap.AbsolutePoseEstimationOptions(ransac=ransac),
+    )
+    if found is None or found["num_inliers"] < max(MIN_AGREEING, MIN_AGREEING_SHARE * len(xy_img)):
+        return None
+    return replace(camera, cam_from_world=found["cam_from_world"].matrix())
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Carried:
+    """Keypoints of image a by geometry in image b, K of them; what b cannot show is left out.
+
+    Args:
+        rows: (K,) of the keypoints of a that were given.
+        xy_b: (K, 2) where b should show them.
+        b_from_a: (K, 2, 2) how the patch lies there.
+        depth_difference: (K,) of what a and b say about the surface, relative.
+        missed_map_px: (K,) distance from the start after the way there and back by b's depth, in pixels of
+            a's depth map.
+    """
+
+    rows: IntArray
+    xy_b: FloatArray
+    b_from_a: FloatArray
+    depth_difference: FloatArray
+    missed_map_px: FloatArray
+
+    def taken(self, chosen: IntArray | BoolArray) -> _Carried:
+        """Some of them."""
+        return _Carried(
+            rows=self.rows[chosen],
+            xy_b=self.xy_b[chosen],
+            b_from_a=self.b_from_a[chosen],
+            depth_difference=self.depth_difference[chosen],
+            missed_map_px=self.missed_map_px[chosen],
+        )
+
+    @property
+    def is_near(self) -> BoolArray:
+        """(K,) whether the depths may be of one surface, the cameras being off."""
+        return self.depth_difference <= DEPTH_TOLERANCE[1]
+
+    @property
+    def is_mutual(self) -> BoolArray:
+        """(K,) whether the depths agree as well as depths do in this pair, and lead back."""
+        return _usual(self.depth_difference, *DEPTH_TOLERANCE) & (self.missed_map_px <= ROUND_TRIP_MAP_PX)
+
+
+def _carried(in_a: _Keypoints, view_a: _View, view_b: _View, camera_b: _Camera) -> _Carried:
+    """Through space to image b, whose camera is ``camera_b``, and back by what depth b has there."""
+    xy_b = camera_b.xy_img(in_a.points_world)
+    beside = camera_b.xy_img((in_a.points_world[:, None] + in_a.tangents_world).reshape(-1, 3)).reshape(-1, 2, 2)
+    b_from_a = np.swapaxes(beside - xy_b[:, None], 1, 2)
+    inverse_depth = _surface_at(view_b, xy_b).inverse_depth
+    back = view_a.camera.xy_img(camera_b.points_world(xy_b, inverse_depth))
+    rows = np.flatnonzero(camera_b.holds(xy_b) & np.isfinite(inverse_depth) & _comparable(b_from_a))
+    everything = _Carried(
+        rows=np.arange(len(in_a)),
+        xy_b=xy_b,
+        b_from_a=b_from_a,
+        depth_difference=np.abs(camera_b.depth(in_a.points_world) * inverse_depth - 1),
+        missed_map_px=np.linalg.norm((back - in_a.xy) * view_a.map_px_per_px, axis=1),
+    )
+    return everything.taken(rows)
+
+
+def _comparable(b_from_a: FloatArray) -> BoolArray:
+    """(K,) whether a patch is neither mirrored nor stretched beyond ``MAX_STRETCH``; false for NaN."""
+    finite = np.asarray(np.isfinite(b_from_a).all(axis=(1, 2)))
+    safe = np.where(finite[:, None, None], b_from_a, 0)
+    stretch = np.linalg.svd(safe, compute_uv=False)
+    alike = (stretch[:, 0] <= MAX_STRETCH) & (stretch[:, 1] >= 1 / MAX_STRETCH) & (np.linalg.det(safe) > 0)
+    return np.asarray(alike)
+
+
+# ------------------------------------------------------------------------------- finding
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Found:
+    """Keypoints of image a that image b shows, best first: (K,) rows and (K, 2) places in b."""
+
+    rows: IntArray
+    xy_b: FloatArray
+
+    def taken(self, chosen: BoolArray) -> _Found:
+        """Some of them."""
+        return _Found(rows=self.rows[chosen], xy_b=self.xy_b[chosen])
+
+
+def _found(in_a: _Keypoints, carried: _Carried, view_a: _View, view_b: _View, reach: float) -> _Found:
+    """Of the keypoints carried over, those whose patch image b shows within reach; no place is taken twice."""
+    aligned = align_patches(
+        view_a.pyramid,
+        in_a.xy[carried.rows],
+        view_b.pyramid,
+        carried.xy_b,
+        carried.b_from_a,
+        reach_px=view_b.camera.reach_px(reach),
+    )
+    order = np.argsort(-aligned.correlation, kind="stable")
+    order = order[(aligned.correlation[order] >= MIN_CORRELATION) & view_b.camera.holds(aligned.xy_b[order])]
+    order = order[_first_in_place(aligned.xy_b[order])]
+    return _Found(rows=carried.rows[order], xy_b=aligned.xy_b[order])
+
+
+def _first_in_place(xy: FloatArray) -> BoolArray:
+    """(K,) false for points that have an earlier one within ``MERGE_PX``."""
+    first = np.ones(len(xy), dtype=bool)
+    if len(xy):
+        for a, b in sorted(cKDTree(xy).query_pairs(MERGE_PX)):
+            first[b] &= not first[a]
+    return first
+
+
+def _attach(tracks: _Tracks, view_a: _View, view_b: _View, in_a: _Keypoints, found: _Found) -> None:
+    """What lies on a keypoint of image b becomes it, the others are new keypoints of b."""
+    new = _keypoints_at(view_b, found.xy_b, in_a.track[found.rows])
+    known = tracks.of(view_b.index)
+    if len(known) and len(new):
+        distance, row = cKDTree(known.xy).query(new.xy, distance_upper_bound=MERGE_PX)
+        on_known = np.isfinite(distance)
+        row, first = np.unique(row[on_known], return_index=True)
+        track_a, track_b = new.track[on_known][first], tracks.roots(view_b.index)[row]
+        # A keypoint of b that has another partner in a keeps it.
+        free = ~np.isin(track_b, tracks.roots(view_a.index))
+        tracks.unite(track_a[free], track_b[free])
+        new = new.taken(~on_known)
+    tracks.add(view_b, new)
+
+
+# ---------------------------------------------------------------------------- photometry
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AlignedPatches:
+    """Where K patches of image a lie in image b.
+
+    Args:
+        xy_b: (K, 2). correlation: (K,) normalised, -1 where the alignment did not settle within its reach.
+    """
+
+    xy_b: FloatArray
+    correlation: FloatArray
+
+
+def align_patches(
+    pyramid_a: Sequence[ByteArray],
+    xy_a: FloatArray,
+    pyramid_b: Sequence[ByteArray],
+    xy_b: FloatArray,
+    b_from_a: FloatArray,
+    *,
+    reach_px: float,
+) -> AlignedPatches:
+    """Shift the warped patches of image a until they fit image b, whatever the brightness and the contrast.
+
+    From the coarsest level that the reach asks for, and both pyramids have, to the finest, by Gauss-Newton
+    with the gradients of the template; a level that fits worse where it ends than where it began is not
+    believed. Patches without texture correlate with nothing.
+
+    Args:
+        pyramid_a, pyramid_b: (H, W) uint8 and its halves by ``cv2.pyrDown``.
+        xy_a: (K, 2) centres of the patches in image a.
+        xy_b: (K, 2) first guesses in image b.
+        b_from_a: (K, 2, 2) how a patch lies in image b, invertible.
+        reach_px: largest distance from the first guess.
+
+    Source: Baker and Matthews 2004, "Lucas-Kanade 20 Years On", inverse compositional, for a translation.
+    """
+    xy = xy_b.copy()
+    correlation = np.full(len(xy), -1.0)
+    settled = np.zeros(len(xy), dtype=bool)
+    for level in reversed(range(min(_levels(reach_px), len(pyramid_a), len(pyramid_b)))):
+        # The centre of a first pixel is that of the next level's, and (0.5, 0.5) at every level.
+        template = _Template.cut(pyramid_a[level], (xy_a - 0.5) / 2**level, b_from_a)
+        end, correlation, settled = template.laid_on(pyramid_b[level], (xy - 0.5) / 2**level)
+        xy = end * 2**level + 0.5
+    within = settled & (np.linalg.norm(xy - xy_b, axis=1) <= reach_px)
+    return AlignedPatches(xy_b=xy, correlation=np.where(within, correlation, -1.0))
+
+
+def _levels(reach_px: float) -> int:
+    """Of a pyramid in whose coarsest image a reach is within ``CAPTURE_PX``; at least one."""
+    return 1 + max(0, int(np.ceil(np.log2(reach_px / CAPTURE_PX))))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Template:
+    """K patches of P pixels, and how they change when they are shifted over image b.
+
+    Args:
+        values: (K, P) of mean zero and length one; zero for a patch without texture.
+        offsets: (K, P, 2) of the pixels in image b.
+        descent: (K, 2, P) the shift that a difference in values asks for.
+    """
+
+    values: Float32Array
+    offsets: Float32Array
+    descent: Float32Array
+
+    @classmethod
+    def cut(cls, image: ByteArray, xy: FloatArray, b_from_a: FloatArray) -> _Template:
+        """At (K, 2), where the centre of the first pixel is (0, 0)."""
+        side = 2 * PATCH_RADIUS + 1
+        wide = _sampled(image, xy, _window(PATCH_RADIUS + 1)[None]).reshape(-1, side + 2, side + 2)
+        values, length = _normalised(wide[:, 1:-1, 1:-1].reshape(-1, side**2))
+        along_x = (wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]) / 2
+        along_y = (wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]) / 2
+        gradient_a = np.stack([along_x, along_y], axis=1).reshape(-1, 2, side**2) / length[:, None]
+        gradient = np.swapaxes(np.linalg.inv(b_from_a), 1, 2).astype(np.float32) @ gradient_a
+        # Values are normalised, so what changes their mean or length alone is no change.
+        gradient -= gradient.mean(axis=2, keepdims=True)
+        gradient -= (gradient @ values[:, :, None]) * values[:, None]
+        hessian = gradient @ np.swapaxes(gradient, 1, 2)
+        textured = np.asarray(np.linalg.det(hessian) > LEAST_TEXTURE)
+        hessian[~textured] = np.eye(2)
+        return cls(
+            values=np.where(textured[:, None], values, 0),
+            offsets=_window(PATCH_RADIUS) @ np.swapaxes(b_from_a, 1, 2).astype(np.float32),
+            descent=(np.linalg.inv(hessian) @ gradient).astype(np.float32),
+        )
+
+    def laid_on(self, image: ByteArray, begin: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Where (K, 2) the patches fit best from (K, 2) on, their correlation there (K,), and whether it settled."""
+        xy, step = begin.copy(), np.zeros(len(begin))
+        correlation = self._correlation(image, begin)
+        moving = np.arange(len(begin))
+        for _ in range(ITERATIONS):
+            values, _ = _normalised(_sampled(image, xy[moving], self.offsets[moving]))
+            shift = (self.descent[moving] @ (self.values[moving] - values)[:, :, None])[..., 0]
+            xy[moving] += shift
+            step[moving] = np.linalg.norm(shift, axis=1)
+            moving = moving[step[moving] > CONVERGED_PX]
+        end = self._correlation(image, xy)
+        better = end >= correlation
+        settled = step <= 5 * CONVERGED_PX
+        return np.where(better[:, None], xy, begin), np.where(better, end, correlation), settled
+
+    def _correlation(self, image: ByteArray, xy: FloatArray) -> FloatArray:
+        values, _ = _normalised(_sampled(image, xy, self.offsets))
+        return np.asarray(np.einsum("kp,kp->k", values, self.values), dtype=np.float64)
+
+
+def _window(radius: int) -> Float32Array:
+    """(P, 2) offsets of a square, row by row."""
+    along = np.arange(-radius, radius + 1, dtype=np.float32)
+    return np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
+
+
+def _sampled(image: ByteArray, xy: FloatArray, offsets: Float32Array) -> Float32Array:
+    """(K, P) grey levels at (K, 2) and offsets (K or 1, P, 2); beyond the border it goes on."""
+    if not len(xy):
+        return np.empty((0, offsets.shape[1]), np.float32)
+    at = xy.astype(np.float32)[:, None] + offsets
+    sampled = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(sampled, dtype=np.float32)
+
+
+def _normalised(patches: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """Mean zero and length one; and the length (K, 1) before, at least that of one grey level in one pixel."""
+    centred = patches - patches.mean(axis=1, keepdims=True)
+    length = np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1)
+    return centred / length, length

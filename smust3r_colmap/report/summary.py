@@ -1,0 +1,424 @@
+"""What came out of a run, for people (``render_text``), programs (``to_json_dict``) and the shell.
+
+The pipeline fills a ``RunSummary`` at its end; nothing here measures or decides anything about
+geometry. The next module to read is ``cli``, which prints it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from smust3r_colmap.execution.progress import format_seconds
+
+EXIT_GOOD = 0
+EXIT_WEAK = 3
+
+# More names than this are counted, not listed, in the text for people; the JSON has them all.
+_NAMES_SHOWN = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelSummary:
+    """One COLMAP model.
+
+    Args:
+        folder: relative to the output folder, with forward slashes, such as ``sparse/0``.
+        num_images: images with a pose in this model.
+        num_points: points of its fused cloud.
+        metric: lengths are metres.
+        segments: names of the segment pieces that were stitched.
+    """
+
+    folder: str
+    num_images: int
+    num_points: int
+    metric: bool
+    segments: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageRemark:
+    """An image that is missing from the result, and why."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageSummary:
+    """What a stage cost.
+
+    Args:
+        name: as in the progress report.
+        wall_s: time that went by.
+        cpu_s: processor time, child processes included.
+        reused: everything was found finished by an earlier run.
+    """
+
+    name: str
+    wall_s: float
+    cpu_s: float
+    reused: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentSummary:
+    """What a backbone made of a segment.
+
+    Args:
+        index: of the segment in the plan.
+        kind: ``"window"`` or ``"loop"``.
+        num_images: images it was given.
+        num_pieces: connected pieces that came out; 0 when nothing did.
+        num_registered: images with a pose, over all its pieces.
+        method: how its largest piece was made, in words; empty when nothing came out.
+        doubts: why its geometry should not be trusted.
+    """
+
+    index: int
+    kind: str
+    num_images: int
+    num_pieces: int
+    num_registered: int
+    method: str
+    doubts: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class EdgeSummary:
+    """An alignment between two segment pieces.
+
+    Args:
+        target, source: names of the pieces.
+        evidence: what it rests on: tracks, pointmaps, poses or links.
+        relative_residual: median residual divided by depth; NaN when no transform was found.
+        accepted: it took part in the stitching.
+        reason: why it was refused, or empty.
+        fallback: why a smaller group than asked for was taken, or empty.
+    """
+
+    target: str
+    source: str
+    evidence: str
+    relative_residual: float
+    accepted: bool
+    reason: str = ""
+    fallback: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopSummary:
+    """A place that the camera may have come back to, and what became of it.
+
+    Args:
+        image_a, image_b: names of the two images that look most alike.
+        similarity: cosine of their descriptors.
+        segment_a, segment_b: windows that hold them. segment: the loop segment.
+        accepted: it closes the loop in the result.
+        reason: why not, or empty.
+        closure_sigmas: how far the loop is from the chain of windows, in standard deviations per degree
+            of freedom; NaN where nothing else connects the two.
+        gap_before_percent, gap_after_percent: distance between where the two windows put the cameras of
+            the second end, joined through the loop, in percent of the extent of all cameras, without
+            and with loop closing; NaN where it cannot be told.
+        turn_before_deg, turn_after_deg: the same for their orientations.
+    """
+
+    image_a: str
+    image_b: str
+    similarity: float
+    segment_a: int
+    segment_b: int
+    segment: int
+    accepted: bool
+    reason: str
+    closure_sigmas: float
+    gap_before_percent: float
+    gap_after_percent: float
+    turn_before_deg: float
+    turn_after_deg: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraphSummary:
+    """The optimisation of all frames.
+
+    Args:
+        num_nodes, num_edges, num_loops: of the graph.
+        cost_before, cost_after: of the same objective; without loops and with one edge per pair, zero.
+        iterations, stop_reason: of the optimiser.
+        improved: its result was used; otherwise the chain was kept.
+    """
+
+    num_nodes: int
+    num_edges: int
+    num_loops: int
+    cost_before: float
+    cost_after: float
+    iterations: int
+    stop_reason: str
+    improved: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefinementStep:
+    """What one step of the refinement did to a model.
+
+    Args:
+        name: of the step.
+        observations_before, observations_after: of tracks of two images or more.
+        error_before_px, error_after_px: mean reprojection error of the points.
+        track_length_before, track_length_after: observations per point.
+        images_before, images_after: registered.
+        moved_percent, max_moved_percent: median and largest of the cameras, in percent of the path's extent.
+        turned_deg: median of the cameras.
+        kept: the step stands. reason: why it was undone, or empty.
+    """
+
+    name: str
+    observations_before: int
+    observations_after: int
+    error_before_px: float
+    error_after_px: float
+    track_length_before: float
+    track_length_after: float
+    images_before: int
+    images_after: int
+    moved_percent: float
+    max_moved_percent: float
+    turned_deg: float
+    kept: bool
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefinementSummary:
+    """Tracks and bundle adjustment of one model.
+
+    Args:
+        folder: of the model, as in ``ModelSummary``.
+        kept: the model has tracks and adjusted cameras. reason: why not, or empty.
+        num_points, num_observations, mean_track_length, reprojection_error_px: of the model with tracks.
+        num_pairs, num_matches: image pairs with tracks, and their matches.
+        num_refused_pairs: verified pairs that contradict the stitched geometry, such as look-alike places.
+        weak: images with fewer than 15 observations, which keep their stitched place.
+        registered: images that had no pose before.
+        principal_point: whether it was freed, and why not, in words; empty where that was never asked.
+        doubts: what speaks against a model that has tracks, in words.
+        steps: in order.
+    """
+
+    folder: str
+    kept: bool
+    reason: str
+    num_points: int
+    num_observations: int
+    mean_track_length: float
+    reprojection_error_px: float
+    num_pairs: int
+    num_matches: int
+    num_refused_pairs: int
+    weak: tuple[str, ...]
+    registered: tuple[str, ...]
+    principal_point: str
+    doubts: tuple[str, ...]
+    steps: tuple[RefinementStep, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MissingOutput:
+    """A part of the result that could not be written, and why."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSummary:
+    """The whole run.
+
+    Args:
+        output: the output folder.
+        num_images: images that could be read.
+        num_registered: distinct images with a pose in at least one model.
+        models: largest first.
+        rejected: files that could not be used.
+        unregistered: images that were read but have no pose in any model.
+        stages: in the order in which they ran.
+        segments: in the order of the plan.
+        edges: alignments that were tried.
+        loops: that were planned. loops_note: why none could be looked for, or empty.
+        graph: the optimisation of the frames of all pieces.
+        peak_memory_bytes: largest resident size of this process or of one of its children.
+        refinements: one per model; empty where none was wanted.
+        missing_outputs: parts of the result that could not be written.
+        remarks: what was left out of those that were written.
+
+    Raises:
+        ValueError: the counts contradict each other, or there is no model.
+    """
+
+    output: Path
+    num_images: int
+    num_registered: int
+    models: tuple[ModelSummary, ...]
+    rejected: tuple[ImageRemark, ...]
+    unregistered: tuple[ImageRemark, ...]
+    stages: tuple[StageSummary, ...]
+    segments: tuple[SegmentSummary, ...]
+    edges: tuple[EdgeSummary, ...]
+    loops: tuple[LoopSummary, ...]
+    loops_note: str
+    graph: GraphSummary
+    peak_memory_bytes: int
+    refinements: tuple[RefinementSummary, ...] = ()
+    missing_outputs: tuple[MissingOutput, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.models:
+            raise ValueError("RunSummary: a run without a model has failed and has no summary")
+        if self.num_registered + len(self.unregistered) != self.num_images:
+            raise ValueError(
+                f"RunSummary: {self.num_registered} registered and {len(self.unregistered)} unregistered images "
+                f"do not make {self.num_images}"
+            )
+
+    @property
+    def metric(self) -> bool:
+        """Every model is in metres."""
+        return all(model.metric for model in self.models)
+
+    @property
+    def scale_statement(self) -> str:
+        """What one unit of length is."""
+        return "metres" if self.metric else "arbitrary (one unit has no length in metres)"
+
+    @property
+    def weak_reasons(self) -> tuple[str, ...]:
+        """Why the result falls short; empty when it does not."""
+        reasons = []
+        if self.rejected:
+            files = self.num_images + len(self.rejected)
+            reasons.append(f"{len(self.rejected)} of {files} files could not be used")
+        if self.unregistered:
+            reasons.append(f"{len(self.unregistered)} of {self.num_images} images got no pose")
+        if len(self.models) > 1:
+            reasons.append(
+                f"the images fall into {len(self.models)} models that could not be connected; "
+                f"the largest has {self.models[0].num_images} of {self.num_images} images"
+            )
+        empty = [str(segment.index) for segment in self.segments if segment.kind == "window" and not segment.num_pieces]
+        if empty:
+            reasons.append(f"nothing came out of segment {', '.join(empty)}")
+        doubted = [segment for segment in self.segments if segment.doubts]
+        if doubted:
+            reasons.append(
+                f"the geometry of {len(doubted)} of {len(self.segments)} segments should not be trusted, such as "
+                f"segment {doubted[0].index}: {doubted[0].doubts[0]}"
+            )
+        if self.refinements and not self.refinements[0].kept:
+            reasons.append(f"the largest model has no tracks: {self.refinements[0].reason}")
+        num_weak = sum(len(one.weak) for one in self.refinements if one.kept)
+        if num_weak:
+            reasons.append(f"{num_weak} images rest on fewer than 15 observations; they keep their stitched place")
+        reasons += [f"{one.folder}: {doubt}" for one in self.refinements if one.kept for doubt in one.doubts]
+        reasons += [f"no {one.name}: {one.reason}" for one in self.missing_outputs]
+        return tuple(reasons)
+
+    @property
+    def exit_code(self) -> int:
+        """For the shell: good, or finished but weak."""
+        return EXIT_WEAK if self.weak_reasons else EXIT_GOOD
+
+    def to_json_dict(self) -> dict[str, Any]:
+        """For ``summary.json``: numbers, strings, lists and null only; NaN becomes null.
+
+        The output folder is left out, because the file lies in it and the folder may move.
+        """
+        facts = asdict(self)
+        del facts["output"]
+        facts["scale"] = self.scale_statement
+        facts["weak_reasons"] = list(self.weak_reasons)
+        plain = _without_nan(facts)
+        assert isinstance(plain, dict)
+        return plain
+
+    def render_text(self) -> str:
+        """Several lines for people, ending without a line break."""
+        lines = [f"{self.num_registered} of {self.num_images} images have a pose. Scale: {self.scale_statement}."]
+        lines += [f"  {_model_line(model)}" for model in self.models]
+        lines += _loop_lines(self.loops, self.loops_note)
+        lines += [line for one in self.refinements for line in _refinement_lines(one)]
+        lines += _remark_lines("without a pose", self.unregistered)
+        lines += _remark_lines("left out", self.rejected)
+        lines += [f"  {remark}" for remark in self.remarks]
+        lines += [f"weak: {reason}" for reason in self.weak_reasons]
+        lines.append(self._cost_line())
+        lines.append(f"Result in {self.output}")
+        return "\n".join(lines)
+
+    def _cost_line(self) -> str:
+        wall_s = sum(stage.wall_s for stage in self.stages)
+        cpu_s = sum(stage.cpu_s for stage in self.stages)
+        reused = [stage.name for stage in self.stages if stage.reused]
+        line = f"Took {format_seconds(wall_s)} (processor time {format_seconds(cpu_s)}), "
+        line += f"at most {self.peak_memory_bytes / 2**30:.1f} GiB of memory per process"
+        return f"{line}; reused from an earlier run: {', '.join(reused)}" if reused else line
+
+
+def _model_line(model: ModelSummary) -> str:
+    segments = f"segments {', '.join(model.segments)}" if len(model.segments) > 1 else "one segment"
+    return f"{model.folder}: {model.num_images} images, {model.num_points} points, {segments}"
+
+
+def _refinement_lines(one: RefinementSummary) -> list[str]:
+    if not one.kept:
+        return [f"  {one.folder}: no tracks ({one.reason})"]
+    lines = [
+        f"  {one.folder}: {one.num_observations} observations of {one.num_points} points "
+        f"(track length {one.mean_track_length:.2f}), reprojection error {one.reprojection_error_px:.2f} px"
+    ]
+    if one.principal_point:
+        lines.append(f"  {one.folder}: principal point {one.principal_point}")
+    lines += [f"  {one.folder}: {step.name} undone, {step.reason}" for step in one.steps if not step.kept]
+    for what, names in (("few observations", one.weak), ("placed by the refinement", one.registered)):
+        if names:
+            more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
+            lines.append(f"  {one.folder}: {what}: {', '.join(names[:_NAMES_SHOWN])}{more}")
+    return lines
+
+
+def _loop_lines(loops: tuple[LoopSummary, ...], note: str) -> list[str]:
+    if not loops:
+        return [f"  no loops: {note}"] if note else []
+    closed = [loop for loop in loops if loop.accepted]
+    lines = [f"  {len(closed)} of {len(loops)} loops closed"]
+    for loop in closed[:_NAMES_SHOWN]:
+        line = f"  loop: {loop.image_a} and {loop.image_b}"
+        if math.isfinite(loop.gap_before_percent):
+            line += f", gap {loop.gap_before_percent:.2f} % of the extent before, {loop.gap_after_percent:.2f} % after"
+        else:
+            line += ", between parts that no overlap connects"
+        lines.append(line)
+    return lines
+
+
+def _remark_lines(what: str, remarks: tuple[ImageRemark, ...]) -> list[str]:
+    lines = [f"  {what}: {remark.name} ({remark.reason})" for remark in remarks[:_NAMES_SHOWN]]
+    if len(remarks) > _NAMES_SHOWN:
+        lines.append(f"  {what}: {len(remarks) - _NAMES_SHOWN} more, see summary.json")
+    return lines
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_nan(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,62 @@
+"""One depth map per image of all models of a run, on disk: ``DepthMaps``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from smust3r_colmap.storage.run_directory import read_array, read_json, write_arrays, write_json
+
+_NAMES = "depth_names.json"
+
+
+class DepthMapWriter:
+    """Writes maps one by one, a file each, so that few are in memory at once.
+
+    Args:
+        folder: of a stage, existing; ``finish`` makes it readable.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._names: list[str] = []
+
+    def write(self, name: str, depth: npt.NDArray[np.float32], confidence: npt.NDArray[np.float32]) -> None:
+        """Depth (H, W) and confidence (H, W) of an image; the first map of a name counts."""
+        if name in self._names:
+            return
+        arrays: dict[str, npt.NDArray[Any]] = {
+            "depth": depth.astype(np.float32),
+            "confidence": np.minimum(confidence, np.finfo(np.float16).max).astype(np.float16),
+        }
+        write_arrays(self._folder / f"{len(self._names):08d}.safetensors", arrays)
+        self._names.append(name)
+
+    def finish(self) -> None:
+        """Say which file is whose."""
+        write_json(self._folder / _NAMES, self._names)
+
+
+class StoredDepthMaps:
+    """What a ``DepthMapWriter`` wrote; implements ``DepthMaps``."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._number = {name: number for number, name in enumerate(read_json(folder / _NAMES))}
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._number
+
+    def depth(self, name: str) -> npt.NDArray[np.float32]:
+        """(H, W) z-depth in units of the stitched world, 0 where there is none; KeyError without a map."""
+        return read_array(self._path(name), "depth")
+
+    def confidence(self, name: str) -> npt.NDArray[np.float32]:
+        """(H, W), at least 1; KeyError without a map."""
+        return read_array(self._path(name), "confidence").astype(np.float32)
+
+    def _path(self, name: str) -> Path:
+        return self._folder / f"{self._number[name]:08d}.safetensors"

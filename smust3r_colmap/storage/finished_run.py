@@ -1,0 +1,193 @@
+"""A finished run, opened again to write its results in other formats; nothing is computed anew.
+
+What a run stitched, refined and fused lies in its ``work`` folder; ``work/finished.json``, written when all stages
+stand, says which of it belongs together. The next module to read is ``exports``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from smust3r_colmap.errors import CollectionError, ImageError, InputError, RunDirectoryError
+from smust3r_colmap.exporters.colmap_sparse import MODEL_FILES
+from smust3r_colmap.importers.image_folder import FolderScan, ImportRecord
+from smust3r_colmap.importers.masks import MaskSet, check_masks
+from smust3r_colmap.products import DepthMaps, Scene
+from smust3r_colmap.refinement.global_refinement import DATABASE_FILE, MODEL_FOLDER
+from smust3r_colmap.storage.run_directory import RunDirectory, read_json, storage_errors, write_json
+from smust3r_colmap.storage.depth_maps import StoredDepthMaps
+from smust3r_colmap.storage.image_scan import store_scan
+from smust3r_colmap.storage.scenes import read_scenes
+
+FINISHED_FILE = "finished.json"
+SCENE_STAGE, STITCHED_STAGE, REFINED_STAGE, IMPORT_STAGE = "scene", "stitched", "refined", "import"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FinishedRun:
+    """All that formats are written from.
+
+    Args:
+        output: the folder that results go to, in most cases the run's own.
+        native_log: for the messages of native code.
+        images: the folder of the original images.
+        scenes: largest first, with their clouds.
+        models: one per scene, folder of the COLMAP model with tracks, or None where there are none.
+        database: that goes with the models, or None.
+        maps: depth of the images, or None.
+        masks: those that the run was made with, or None.
+    """
+
+    output: Path
+    native_log: Path
+    images: Path
+    scenes: tuple[Scene, ...]
+    models: tuple[Path | None, ...]
+    database: Path | None
+    maps: DepthMaps | None
+    masks: MaskSet | None = None
+
+    def sparse_model(self, number: int) -> Path:
+        """Where the COLMAP model number ``number`` goes."""
+        return self.output / "sparse" / str(number)
+
+
+def write_finished(run: RunDirectory, finished: FinishedRun) -> None:
+    """Say that the run is complete, where its images are and which parts it has."""
+    facts = {
+        "images": str(finished.images.resolve()),
+        "with_tracks": [model is not None for model in finished.models],
+        "with_maps": finished.maps is not None,
+        "masks": None if finished.masks is None else _masks_to_json(finished.masks),
+    }
+    write_json(run.work / FINISHED_FILE, facts)
+
+
+def begin_stages(run: RunDirectory, scan: FolderScan, *, fresh: bool) -> None:
+    """To be called before the stages change: until the run ends again, they do not belong together.
+
+    And no earlier than the input is known to be of use, for until then the folder may hold a finished run.
+
+    Args:
+        scan: of the image folder.
+        fresh: throw away all that an earlier run left.
+    """
+    if fresh:
+        run.start_over(MODEL_FILES)
+    with storage_errors(run.work):
+        (run.work / FINISHED_FILE).unlink(missing_ok=True)
+    store_scan(scan, run)
+
+
+def check_is_finished(root: Path) -> None:
+    """Refuse a folder that holds no finished run, before it is locked and thereby touched.
+
+    Raises:
+        InputError: there is no such folder, or no finished run in it.
+    """
+    if not root.is_dir():
+        raise InputError(f"{root}: there is no such folder; give the output folder of reconstruct or refine")
+    if not (root / "work" / "lock").is_file():
+        raise InputError(f"{root}: is no run of this program, for it has no work folder of one")
+    if not (root / "work" / FINISHED_FILE).is_file():
+        raise InputError(
+            f"{root}: the run is not finished; start the reconstruct or refine that made it again, it goes on"
+        )
+
+
+def open_finished(run: RunDirectory, *, images: Path | None = None, output: Path | None = None) -> FinishedRun:
+    """What the run has stored.
+
+    Args:
+        run: held by this process, so that nobody changes it meanwhile; see ``check_is_finished``.
+        images: the folder of the images, where it has moved since.
+        output: where results shall go instead of the run's folder.
+
+    Raises:
+        RunDirectoryError: the run was made by another version.
+        StorageError: a stage cannot be read.
+    """
+    facts = read_json(run.work / FINISHED_FILE)
+    try:
+        images_then, with_tracks, with_maps = Path(facts["images"]), facts["with_tracks"], facts["with_maps"]
+        masks = _masks_from_json(facts.get("masks"))
+    except (KeyError, TypeError, AttributeError) as error:
+        raise RunDirectoryError(
+            f"{run.work / FINISHED_FILE}: was written by another version; start the same reconstruct command again"
+        ) from error
+    refined = run.work / REFINED_STAGE
+    return FinishedRun(
+        output=run.root if output is None else output,
+        native_log=run.native_log,
+        images=images_then if images is None else images,
+        scenes=read_scenes(run.work / SCENE_STAGE),
+        models=tuple(refined / str(k) / MODEL_FOLDER if has else None for k, has in enumerate(with_tracks)),
+        database=refined / DATABASE_FILE if any(with_tracks) else None,
+        maps=StoredDepthMaps(run.work / STITCHED_STAGE) if with_maps else None,
+        masks=masks,
+    )
+
+
+def _masks_to_json(masks: MaskSet) -> dict[str, Any]:
+    return {"folder": str(masks.folder.resolve()), "digests": dict(masks.digest_of)}
+
+
+def _masks_from_json(facts: Mapping[str, Any] | None) -> MaskSet | None:
+    return None if facts is None else MaskSet(folder=Path(facts["folder"]), digest_of=dict(facts["digests"]))
+
+
+# -------------------------------------------------------------------- images and masks
+def check_images(run: RunDirectory, finished: FinishedRun) -> None:
+    """Refuse images that are not those the run was made of: their pixels would not fit its cameras.
+
+    A file of the same size that was touched since is compared by its content.
+
+    Raises:
+        CollectionError: the folder is gone.
+        ImageError: a file is gone, or another one now.
+    """
+    if not finished.images.is_dir():
+        raise CollectionError(f"{finished.images}: the images are not there any more; say with --images where they are")
+    stored = read_json(run.work / IMPORT_STAGE / "records.json")
+    known = {record.name: record for record in map(ImportRecord.from_json, stored)}
+    for name in _names(finished.scenes):
+        _check_image(finished.images / name, known[name])
+
+
+def check_masks_of_run(finished: FinishedRun) -> None:
+    """Refuse masks that are not those the run was made with, for formats that take them along.
+
+    Raises:
+        InputError, ImageError: as ``check_masks``; the message names ``--masks``.
+    """
+    if finished.masks is not None:
+        check_masks(finished.masks, _names(finished.scenes))
+
+
+def _names(scenes: Iterable[Scene]) -> list[str]:
+    return list(dict.fromkeys(name for scene in scenes for name in scene.image_names))
+
+
+def _check_image(path: Path, record: ImportRecord) -> None:
+    try:
+        status = path.stat()
+        if (status.st_size, status.st_mtime_ns) == (record.size_bytes, record.mtime_ns):
+            return
+        same = status.st_size == record.size_bytes and _digest(path) == record.digest
+    except FileNotFoundError as error:
+        raise ImageError(f"{record.name}: is not in {path.parent} any more; say with --images where it is") from error
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
+    if not same:
+        raise ImageError(
+            f"{path}: has changed since the run ({record.size_bytes} bytes then, {status.st_size} now); "
+            "put the old file back, or reconstruct again"
+        )
+
+
+def _digest(path: Path) -> str:
+    return hashlib.blake2b(path.read_bytes(), digest_size=20).hexdigest()

@@ -1,0 +1,1 @@
+"""Scenes with exactly known cameras, and a backbone simulated from them."""
