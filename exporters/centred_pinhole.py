@@ -18,10 +18,8 @@ import numpy.typing as npt
 import pycolmap
 
 from smust3r_colmap.errors import InputError
+from smust3r_colmap.geometry.arrays import FloatArray, UInt8Array
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
-
-FloatArray = npt.NDArray[np.float64]
-UInt8Array = npt.NDArray[np.uint8]
 
 _STRIP_PIXELS = 1 << 20
 """Pixels looked up at once: 24 MB of rays, whatever the size of the image."""

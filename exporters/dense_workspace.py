@@ -33,16 +33,16 @@ import numpy.typing as npt
 import pycolmap
 from PIL import ExifTags, Image
 
+from smust3r_colmap.dense.depth_consistency import ModelDepth, depth_of_model
 from smust3r_colmap.errors import ImageError, InputError, ReconstructionError, StorageError
 from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks, usable_cores
 from smust3r_colmap.exporters.atomic_write import replaced_folder
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.importers.images import inspect, load_rgb
-from smust3r_colmap.dense.depth_consistency import ModelDepth, depth_of_model
 from smust3r_colmap.products import DepthMaps, SourceImage
 
 logger = logging.getLogger(__name__)
 
-FloatArray = npt.NDArray[np.float64]
 FloatMap = npt.NDArray[np.float32]
 TaskT = TypeVar("TaskT")
 ResultT = TypeVar("ResultT")

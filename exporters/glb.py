@@ -14,11 +14,10 @@ import numpy.typing as npt
 import trimesh
 
 from smust3r_colmap.exporters.atomic_write import replace_file
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import PointCloud, Scene
-
-FloatArray = npt.NDArray[np.float64]
 
 FRUSTUM_PER_STEP = 0.6
 """Depth of a frustum over the usual distance of consecutive cameras: neighbours do not interleave."""

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-UInt16Array = npt.NDArray[np.uint16]
+from smust3r_colmap.geometry.arrays import UInt16Array
 
 STEPS = 65536
 NEAREST_QUANTILE = 0.01

@@ -28,16 +28,11 @@ import trimesh
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from smust3r_colmap.cli.doctor import advice_for
-from smust3r_colmap.errors import InputError, MissingDependencyError, ReconstructionError
+from smust3r_colmap.errors import InputError, MissingDependencyError, ReconstructionError, advice_for
 from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks
 from smust3r_colmap.exporters.atomic_write import replace_file
+from smust3r_colmap.geometry.arrays import BoolArray, FloatArray, IntArray, UInt8Array
 from smust3r_colmap.geometry.camera import pixel_centres
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-UInt8Array = npt.NDArray[np.uint8]
-BoolArray = npt.NDArray[np.bool_]
 
 MIN_POINTS = 100
 """Fewer points of the cloud make no surface worth a file."""

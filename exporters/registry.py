@@ -13,20 +13,21 @@ from pathlib import Path
 
 import pycolmap
 
+from smust3r_colmap.colmap.model_files import MODEL_FILES, refuse_names_text_cannot_hold
 from smust3r_colmap.config import OutputConfig
 from smust3r_colmap.errors import InputError, MissingDependencyError, ReconstructionError
+from smust3r_colmap.execution.stage_clock import StageClock
 from smust3r_colmap.exporters.atomic_write import replaced_folder
-from smust3r_colmap.exporters.colmap_sparse import MODEL_FILES, refuse_names_text_cannot_hold, write_colmap_sparse
+from smust3r_colmap.exporters.colmap_sparse import write_colmap_sparse
 from smust3r_colmap.exporters.dense_workspace import write_dense_workspace
 from smust3r_colmap.exporters.glb import write_glb
 from smust3r_colmap.exporters.mesh import MeshMethod, write_mesh
 from smust3r_colmap.exporters.ply import write_ply
 from smust3r_colmap.exporters.trainer_folder import write_trainer_folder
 from smust3r_colmap.exporters.tum_trajectory import write_tum
+from smust3r_colmap.products import MissingOutput, Outputs, Written
 from smust3r_colmap.storage.finished_run import FinishedRun
 from smust3r_colmap.storage.run_directory import storage_errors
-from smust3r_colmap.execution.stage_clock import StageClock
-from smust3r_colmap.report.summary import MissingOutput
 
 TRAINER_FOLDER, DENSE_FOLDER, DATABASE_FILE = "trainer", "dense", "database.db"
 _NAMES_SHOWN = 3
@@ -61,19 +62,6 @@ class FormatSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Written:
-    """What a format has written.
-
-    Args:
-        name: the file or folder, below the output folder.
-        remarks: what the user should know of it, such as what was left out.
-    """
-
-    name: str
-    remarks: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
 class Format:
     """One way to write a run.
 
@@ -90,14 +78,6 @@ class Format:
     about: str
     reads_images: bool = False
     reads_masks: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class Outputs:
-    """What came of several formats: which could not be written, and the remarks of the others."""
-
-    missing: tuple[MissingOutput, ...]
-    remarks: tuple[str, ...]
 
 
 def write_where_possible(

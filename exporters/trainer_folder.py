@@ -24,10 +24,10 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 from scipy.spatial import cKDTree
 
+from smust3r_colmap.dense.depth_consistency import depth_of_model
 from smust3r_colmap.errors import InputError, StorageError
 from smust3r_colmap.exporters.atomic_write import replaced_folder
 from smust3r_colmap.exporters.centred_pinhole import CentredPinhole
@@ -44,12 +44,11 @@ from smust3r_colmap.exporters.trainer_images import (
 )
 from smust3r_colmap.exporters.trainer_selection import LeftOut, Selection, nearest_camera_distance, select_for_training
 from smust3r_colmap.exporters.transforms_json import points_saved, transforms_json
-from smust3r_colmap.dense.depth_consistency import depth_of_model
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.products import DepthMaps, PointCloud
 
 logger = logging.getLogger(__name__)
 
-FloatArray = npt.NDArray[np.float64]
 
 LONGEST_DEPTH_PX = 640
 """Longer side of the largest depth maps. Backbones give 256 to 512 pixels, so larger files hold nothing more, and

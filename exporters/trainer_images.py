@@ -26,11 +26,10 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from smust3r_colmap.errors import ImageError, InputError
 from smust3r_colmap.execution.task_pool import usable_cores
 from smust3r_colmap.exporters.centred_pinhole import CentredPinhole, resampled
+from smust3r_colmap.geometry.arrays import UInt8Array
 from smust3r_colmap.importers.images import load_rgb
 from smust3r_colmap.importers.masks import find_mask, load_mask
 from smust3r_colmap.products import SourceImage
-
-UInt8Array = npt.NDArray[np.uint8]
 
 JPEG_PARAMS = (
     *(cv2.IMWRITE_JPEG_QUALITY, 97),

@@ -22,10 +22,7 @@ from scipy.spatial import cKDTree
 
 from smust3r_colmap.errors import InputError
 from smust3r_colmap.exporters.centred_pinhole import CentredPinhole
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
+from smust3r_colmap.geometry.arrays import BoolArray, FloatArray, IntArray
 
 FAR_CAMERA = 5.0
 """Gap between a camera, or a group of them, and all others from which on it is left out, in usual distances. Cameras

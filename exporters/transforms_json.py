@@ -13,13 +13,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import PointCloud
-
-FloatArray = npt.NDArray[np.float64]
 
 SAVED_FROM_WORLD = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0]])
 """(3, 4) nerfstudio's ``applied_transform``: from COLMAP's world to that of the file."""

@@ -18,14 +18,13 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.errors import InputError
+from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.colmap_records import CameraRecord, ImageRecord, PointRecords, Repairs, read_records
 from smust3r_colmap.products import EMPTY_CLOUD, PointCloud, RejectedImage
 
 logger = logging.getLogger(__name__)
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 MIN_IMAGES = 2
 ROUNDED_QUATERNION = 1e-4

@@ -25,9 +25,7 @@ import numpy.typing as npt
 import pycolmap
 
 from smust3r_colmap.errors import InputError
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 
 _WHERE_MODELS_LIE = ("", "sparse/0", "sparse", "0")
 """Below the folder that a person names; the first that holds cameras and images is taken."""

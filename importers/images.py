@@ -36,12 +36,12 @@ from PIL.TiffImagePlugin import TiffImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from smust3r_colmap.errors import ImageError
+from smust3r_colmap.geometry.arrays import UInt8Array
 from smust3r_colmap.importers.camera_prior import CameraTags, read_camera_tags
 from smust3r_colmap.products import SourceImage
 
 logger = logging.getLogger(__name__)
 
-UInt8Array = npt.NDArray[np.uint8]
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
 """Of files taken for images, in any case; what is inside is told by the content."""

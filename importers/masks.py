@@ -15,13 +15,11 @@ from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from smust3r_colmap.errors import ImageError, InputError
+from smust3r_colmap.geometry.arrays import UInt8Array
 from smust3r_colmap.importers.images import stored_size
 from smust3r_colmap.products import ImageCollection, ImageMask, SourceImage
-
-UInt8Array = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True, kw_only=True)

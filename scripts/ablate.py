@@ -16,8 +16,8 @@ from a set with depth, and figures are means over seeds. With the classical back
 is a whole run; those of one segment length share a run directory, and so features and mapping.
 
 APE is the root mean square distance of camera centres after a Sim(3) fit, AAE the mean angle between
-orientations, both of the largest model (``smust3r_colmap.evaluation.trajectory``); "of the chain" is the spanning tree of
-the windows before the pose graph, which by itself weighs both edges of every pair.
+orientations, both of the largest model (``smust3r_colmap.evaluation.trajectory``); "of the chain" is the spanning
+tree of the windows before the pose graph, which by itself weighs both edges of every pair.
 """
 
 from __future__ import annotations
@@ -37,12 +37,8 @@ import numpy as np
 from compare_with_colmap import DATA, SUBSET_FILE, open_dataset
 from plot_trajectory import Trajectories, draw_trajectories, read_tum_by_name
 
-from smust3r_colmap.alignment.pairwise import Edges, align_pieces
+from smust3r_colmap.alignment.pairwise import align_pieces
 from smust3r_colmap.backbones.base import BackboneResult
-from smust3r_colmap.synthetic.backbone import OracleBackbone, oracle_maps
-from smust3r_colmap.synthetic.settings import PRESETS, REFERENCE_LENGTH, OracleSettings
-from smust3r_colmap.synthetic.truth import TrueScene, collection_of
-from smust3r_colmap.stitching.spanning_tree import ChainedPart
 from smust3r_colmap.config import (
     AlignmentEdges,
     ConfidenceWeighting,
@@ -50,19 +46,23 @@ from smust3r_colmap.config import (
     RunConfig,
     TransformGroup,
 )
-from smust3r_colmap.synthetic.room import write_demo
 from smust3r_colmap.errors import ConfigError, SmustrError
 from smust3r_colmap.evaluation.trajectory import Evaluation, Trajectory, compare_trajectories
-from smust3r_colmap.dense.point_cloud import fuse_cameras
+from smust3r_colmap.execution.progress import QuietReporter
 from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.sim3 import invert_rigid
-from smust3r_colmap.segmentation.loop_segments import LoopPlan, PlannedLoop, plan_loops
 from smust3r_colmap.pipeline import NOT_LOOKED_FOR, reconstruct
-from smust3r_colmap.products import Segment
-from smust3r_colmap.execution.progress import QuietReporter
-from smust3r_colmap.stitching.resection import PlacedPiece, place_piece
+from smust3r_colmap.products import Edges, Segment
+from smust3r_colmap.segmentation.loop_segments import LoopPlan, PlannedLoop, plan_loops
 from smust3r_colmap.segmentation.windows import plan_windows
+from smust3r_colmap.stitching.camera_fusion import fuse_cameras
+from smust3r_colmap.stitching.resection import PlacedPiece, place_piece
+from smust3r_colmap.stitching.spanning_tree import ChainedPart
 from smust3r_colmap.stitching.stitch import Stitching, stitch
+from smust3r_colmap.synthetic.backbone import OracleBackbone, oracle_maps
+from smust3r_colmap.synthetic.room import write_demo
+from smust3r_colmap.synthetic.settings import PRESETS, REFERENCE_LENGTH, OracleSettings
+from smust3r_colmap.synthetic.truth import TrueScene, collection_of
 
 DriftOf = Literal["image", "segment"]
 

@@ -37,16 +37,15 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.alignment.from_pointmaps import NUM_PIXELS, align_pointmaps
-from smust3r_colmap.estimators.sim3 import PieceFit
-from smust3r_colmap.alignment.seen_points import align_seen_points
+from smust3r_colmap.alignment.seen_points import PieceFit, align_seen_points
 from smust3r_colmap.config import AlignmentConfig, TransformGroup
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.sl4 import SL4
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import SegmentPiece
 
-FloatArray = npt.NDArray[np.float64]
 Outliers = Literal["none", "blob", "random"]
 
 ROOM_M = np.array([6.0, 3.0, 4.0])

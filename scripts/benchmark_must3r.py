@@ -77,12 +77,11 @@ from smust3r_colmap.backbones.must3r.precision import choose_device, choose_prec
 from smust3r_colmap.backbones.must3r.preprocessing import NetworkImage, preprocess
 from smust3r_colmap.backbones.must3r.recipe import recipe_weights
 from smust3r_colmap.config import CameraFit, Device, ImportConfig, Precision
-from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.importers.image_folder import import_image_folder
 from smust3r_colmap.importers.images import load_rgb
 from smust3r_colmap.products import ImageCollection
-
-FloatArray = npt.NDArray[np.float64]
+from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
 
 STAGES = ("preprocess", "encode", "add", "render", "cameras", "maps")
 NETWORK_STAGES = ("encode", "add", "render", "cameras")

@@ -20,14 +20,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
 from smust3r_colmap.backbones.classical.plane_sweep import ImageDepth, reconstruct_depth
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.products import Tracks
-
-FloatArray = npt.NDArray[np.float64]
 
 MAX_FEATURES = 4096
 MATCH_NEIGHBOURS = 8

@@ -31,16 +31,13 @@ from dataclasses import dataclass, replace
 
 import benchmark_alignment
 import numpy as np
-import numpy.typing as npt
 
+from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.sl4 import SL4
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.stitching.pose_graph.graph import PoseGraph
 from smust3r_colmap.stitching.pose_graph.optimise import GraphSolution, Kernel, optimise
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 STEP = 0.5
 SIGMAS = np.array([0.01] * 3 + [np.deg2rad(0.3)] * 3 + [0.01])

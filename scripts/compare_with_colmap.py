@@ -52,14 +52,8 @@ from plot_trajectory import read_tum_by_name
 
 from smust3r_colmap.config import SegmentationConfig
 from smust3r_colmap.errors import DegenerateAlignmentError
-from smust3r_colmap.evaluation.trajectory import (
-    Evaluation,
-    Trajectory,
-    compare_trajectories,
-    read_poses_txt,
-    read_reference_sparse,
-    read_transforms_json,
-)
+from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse, read_transforms_json
+from smust3r_colmap.evaluation.trajectory import Evaluation, Trajectory, compare_trajectories
 from smust3r_colmap.execution.task_pool import usable_cores
 from smust3r_colmap.importers.image_folder import natural_key
 

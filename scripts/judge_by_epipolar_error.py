@@ -34,10 +34,9 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from smust3r_colmap.errors import InputError, SmustrError
+from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.importers.image_folder import natural_key
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 Pair = tuple[str, str]
 Models = Mapping[str, pycolmap.Reconstruction]
 

@@ -28,13 +28,14 @@ import numpy.typing as npt
 import pycolmap
 from benchmark_plane_sweep import COLOUR_FROM_SENSOR
 
-from smust3r_colmap.synthetic.truth import TrueScene, z_buffer
 from smust3r_colmap.errors import InputError, SmustrError
-from smust3r_colmap.evaluation.trajectory import compare_trajectories, read_poses_txt, read_reference_sparse
+from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse
+from smust3r_colmap.evaluation.trajectory import compare_trajectories
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.synthetic.truth import TrueScene, z_buffer
 
-FloatArray = npt.NDArray[np.float64]
 FloatMap = npt.NDArray[np.float32]
 
 REGISTRATIONS = {"kinect": COLOUR_FROM_SENSOR, "none": np.eye(3, 4)}

@@ -15,21 +15,15 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.errors import InputError
-from smust3r_colmap.evaluation.trajectory import (
-    Trajectory,
-    compare_trajectories,
-    read_poses_txt,
-    read_reference_sparse,
-    read_transforms_json,
-)
+from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse, read_transforms_json
+from smust3r_colmap.evaluation.trajectory import Trajectory, compare_trajectories
+from smust3r_colmap.geometry.arrays import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 Trajectories = Mapping[str, Trajectory]
 
 STYLES = {

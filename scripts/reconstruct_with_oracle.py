@@ -30,17 +30,17 @@ from benchmark_plane_sweep import COLOUR_FROM_SENSOR
 from judge_depth_maps import NO_LIMIT_PX, depth_in_view
 
 from smust3r_colmap.backbones.base import BackboneContext, BackboneFactory
+from smust3r_colmap.config import OutputConfig, RunConfig
+from smust3r_colmap.errors import InputError, SmustrError
+from smust3r_colmap.execution.progress import reporter_for
+from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.pipeline import reconstruct
+from smust3r_colmap.storage.run_directory import storage_errors
 from smust3r_colmap.synthetic.backbone import OracleBackbone
 from smust3r_colmap.synthetic.distortion import homogeneous
 from smust3r_colmap.synthetic.settings import PRESETS
 from smust3r_colmap.synthetic.truth import TrueScene
-from smust3r_colmap.config import OutputConfig, RunConfig
-from smust3r_colmap.errors import InputError, SmustrError
-from smust3r_colmap.geometry.camera import Intrinsics
-from smust3r_colmap.geometry.sim3 import invert_rigid
-from smust3r_colmap.pipeline import reconstruct
-from smust3r_colmap.execution.progress import reporter_for
-from smust3r_colmap.storage.run_directory import storage_errors
 
 FloatMap = npt.NDArray[np.float32]
 RgbImage = npt.NDArray[np.uint8]

@@ -19,9 +19,7 @@ import trimesh
 from PIL import Image
 
 from smust3r_colmap.errors import InputError
-
-FloatArray = npt.NDArray[np.float64]
-UInt8Array = npt.NDArray[np.uint8]
+from smust3r_colmap.geometry.arrays import FloatArray, UInt8Array
 
 SIDE_PX = 900
 BACKGROUND = 255

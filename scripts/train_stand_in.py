@@ -33,7 +33,6 @@ from itertools import count
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
@@ -51,10 +50,10 @@ from smust3r_colmap.backbones.must3r.encoder import Encoder
 from smust3r_colmap.backbones.must3r.head import activate
 from smust3r_colmap.backbones.must3r.preprocessing import preprocess
 from smust3r_colmap.backbones.must3r.rope import grid_positions, rope_table
-from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import pixel_centres
+from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
 
-FloatArray = npt.NDArray[np.float64]
 Grid = tuple[slice, slice]
 
 PATCH = 16

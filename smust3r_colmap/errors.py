@@ -20,6 +20,20 @@ The next module to read is ``products``.
 
 from __future__ import annotations
 
+import re
+
+# Where the name to import is not the name to install.
+_DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow"}
+# Start of a shared library's name, and the Debian or Ubuntu package that has it.
+_SYSTEM_PACKAGES = {
+    "libusb-1.0": "libusb-1.0-0",
+    "libGL": "libgl1",
+    "libEGL": "libegl1",
+    "libgomp": "libgomp1",
+    "libX11": "libx11-6",
+    "libglib": "libglib2.0-0",
+}
+
 
 class SmustrError(Exception):
     """Root of every error raised on purpose."""
@@ -71,3 +85,20 @@ class DownloadError(SmustrError):
 
 class MissingDependencyError(SmustrError):
     """An optional package is not installed; the message names what to install."""
+
+
+def advice_for(stderr: str) -> str:
+    """Why an import failed and what to install, from what the child process wrote; its last line is the exception."""
+    ours = re.fullmatch(r"smust3r_colmap\.errors\.\w+: (.+)", (stderr.strip().splitlines() or [""])[-1])
+    if ours:
+        return ours[1]
+    library = re.search(r"(lib[\w.+-]+?\.so[\w.]*): cannot open shared object file", stderr)
+    if library:
+        owner = next((owner for start, owner in _SYSTEM_PACKAGES.items() if library[1].startswith(start)), None)
+        remedy = f"install the system package {owner} (Debian's name)" if owner else "install the package that has it"
+        return f"the system library {library[1]} is missing; {remedy}"
+    missing = re.search(r"No module named '([\w]+)", stderr)
+    if missing:
+        return f"{missing[1]} is not installed; pip install {_DISTRIBUTIONS.get(missing[1], missing[1])}"
+    lines = stderr.strip().splitlines()
+    return f"cannot be imported: {lines[-1] if lines else 'no message'}"

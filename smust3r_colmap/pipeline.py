@@ -23,24 +23,26 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from smust3r_colmap.dense import point_cloud as fusion
-from smust3r_colmap.alignment.pairwise import Edges, align_pieces, candidate_pairs, needs_maps
+from smust3r_colmap.alignment.pairwise import align_pieces, candidate_pairs, needs_maps
 from smust3r_colmap.backbones.base import Backbone, BackboneContext, BackboneFactory, BackboneResult
+from smust3r_colmap.backbones.masked_maps import without_masked_depth
 from smust3r_colmap.backbones.registry import make_backbone, read_options
-from smust3r_colmap.stitching.spanning_tree import ChainedPart
+from smust3r_colmap.colmap.model_files import MODEL_FILES, refuse_names_text_cannot_hold
 from smust3r_colmap.config import RunConfig
-from smust3r_colmap.storage.config_file import config_to_toml
+from smust3r_colmap.dense.depth_consistency import depth_scales
+from smust3r_colmap.dense.point_cloud import fuse_points
 from smust3r_colmap.errors import (
     ConfigError,
     DegenerateAlignmentError,
     ReconstructionError,
 )
+from smust3r_colmap.execution.progress import Reporter
+from smust3r_colmap.execution.stage_clock import StageClock, peak_memory_bytes
 from smust3r_colmap.execution.task_pool import usable_cores
 from smust3r_colmap.exporters.atomic_write import replace_file
-from smust3r_colmap.exporters.colmap_sparse import MODEL_FILES, refuse_names_text_cannot_hold
+from smust3r_colmap.exporters.registry import FORMATS, FormatSettings, write_where_possible
 from smust3r_colmap.exporters.tum_trajectory import write_tum
-from smust3r_colmap.exporters.registry import FORMATS, FormatSettings, Outputs, write_where_possible
-from smust3r_colmap.storage.finished_run import FinishedRun, begin_stages, write_finished
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.importers.image_folder import (
@@ -51,32 +53,20 @@ from smust3r_colmap.importers.image_folder import (
     collection_from_scan,
 )
 from smust3r_colmap.importers.masks import masks_of, names_without_mask, with_masks
-from smust3r_colmap.segmentation.loop_segments import LoopPlan, plan_loops
-from smust3r_colmap.backbones.masked_maps import without_masked_depth
-from smust3r_colmap.dense.depth_consistency import depth_scales
 from smust3r_colmap.products import (
     EMPTY_CLOUD,
     DenseMaps,
     DepthMaps,
-    FloatArray,
+    Edges,
     ImageCollection,
+    Outputs,
     PointCloud,
     Scene,
     Segment,
     SegmentPiece,
     largest_first,
 )
-from smust3r_colmap.execution.progress import Reporter
 from smust3r_colmap.refinement.stage import Refinement, refine
-from smust3r_colmap.stitching.resection import PlacedPiece, place_piece
-from smust3r_colmap.storage.run_directory import RunDirectory, key_of, read_json, write_json
-from smust3r_colmap.segmentation.windows import plan_windows
-from smust3r_colmap.execution.stage_clock import StageClock, peak_memory_bytes
-from smust3r_colmap.stitching.stitch import Stitching, stitch
-from smust3r_colmap.storage.alignments import read_edges, write_edges
-from smust3r_colmap.storage.depth_maps import DepthMapWriter, StoredDepthMaps
-from smust3r_colmap.storage.image_scan import scan_changed_files
-from smust3r_colmap.storage.scenes import read_scenes, write_scenes
 from smust3r_colmap.report.summary import (
     EdgeSummary,
     GraphSummary,
@@ -88,6 +78,25 @@ from smust3r_colmap.report.summary import (
     RunSummary,
     SegmentSummary,
 )
+from smust3r_colmap.segmentation.loop_segments import LoopPlan, plan_loops
+from smust3r_colmap.segmentation.windows import plan_windows
+from smust3r_colmap.stitching.camera_fusion import (
+    FusedCameras,
+    build_scene,
+    depth_in_cameras,
+    fuse_cameras,
+    fuse_intrinsics,
+)
+from smust3r_colmap.stitching.resection import PlacedPiece, place_piece
+from smust3r_colmap.stitching.spanning_tree import ChainedPart
+from smust3r_colmap.stitching.stitch import Stitching, stitch
+from smust3r_colmap.storage.alignments import read_edges, write_edges
+from smust3r_colmap.storage.config_file import config_to_toml
+from smust3r_colmap.storage.depth_maps import DepthMapWriter, StoredDepthMaps
+from smust3r_colmap.storage.finished_run import FinishedRun, begin_stages, write_finished
+from smust3r_colmap.storage.image_scan import scan_changed_files
+from smust3r_colmap.storage.run_directory import RunDirectory, key_of, read_json, write_json
+from smust3r_colmap.storage.scenes import read_scenes, write_scenes
 
 NOT_LOOKED_FOR = LoopPlan(threshold=None, weak_threshold=None, neighbours=0, statistics=None)
 
@@ -322,9 +331,9 @@ def _place(
                 maps = DepthMapWriter(folder)
                 for part in sorted(parts, key=lambda part: -_num_images(part, result)):
                     placed = _placed_pieces(part, result, segments)
-                    cameras = fusion.fuse_cameras(placed)
+                    cameras = fuse_cameras(placed)
                     scenes.append(_scene(placed, cameras, EMPTY_CLOUD, result, collection))
-                    for image, depth, confidence in fusion.depth_in_cameras(placed, _dense(part, result), cameras):
+                    for image, depth, confidence in depth_in_cameras(placed, _dense(part, result), cameras):
                         maps.write(collection.images[image].name, depth, confidence)
                     stage.advance()
                 maps.finish()
@@ -380,8 +389,8 @@ def _fuse(
         for number, scene in enumerate(scenes):
             part = part_of[scene.segments]
             placed = _placed_pieces(part, result, segments)
-            cameras, scale = _cameras_of(scene, fusion.fuse_cameras(placed), number, refinement, stitched.maps)
-            cloud = fusion.fuse_points(
+            cameras, scale = _cameras_of(scene, fuse_cameras(placed), number, refinement, stitched.maps)
+            cloud = fuse_points(
                 placed,
                 _dense(part, result),
                 cameras,
@@ -397,8 +406,8 @@ def _fuse(
 
 
 def _cameras_of(
-    scene: Scene, fused: fusion.FusedCameras, number: int, refinement: Refinement | None, maps: DepthMaps
-) -> tuple[fusion.FusedCameras, FloatArray | None]:
+    scene: Scene, fused: FusedCameras, number: int, refinement: Refinement | None, maps: DepthMaps
+) -> tuple[FusedCameras, FloatArray | None]:
     """The fused cameras with the poses of the scene, and what each depth map is to be multiplied with."""
     model = None if refinement is None else refinement.models[number]
     if model is None:
@@ -431,16 +440,16 @@ def _placed_pieces(part: ChainedPart, result: BackboneResult, segments: tuple[Se
 
 def _scene(
     placed: tuple[PlacedPiece, ...],
-    cameras: fusion.FusedCameras,
+    cameras: FusedCameras,
     cloud: PointCloud,
     result: BackboneResult,
     collection: ImageCollection,
 ) -> Scene:
-    intrinsics = fusion.fuse_intrinsics(placed, [image.camera for image in collection.images])
+    intrinsics = fuse_intrinsics(placed, [image.camera for image in collection.images])
     if collection.calibrated:
         intrinsics = {camera: collection.cameras[camera] for camera in intrinsics}
     metric = all(result.reconstructions[one.piece.segment].metric for one in placed)
-    return fusion.build_scene(collection, placed, cameras, intrinsics, cloud, metric=metric)
+    return build_scene(collection, placed, cameras, intrinsics, cloud, metric=metric)
 
 
 def _members(part: ChainedPart) -> list[tuple[int, Transform]]:
@@ -486,7 +495,7 @@ def _without_loops(
     except DegenerateAlignmentError as error:
         clock.note(f"no trajectory without loops: {error}")
         return None
-    return _scene(placed, fusion.fuse_cameras(placed), EMPTY_CLOUD, result, collection)
+    return _scene(placed, fuse_cameras(placed), EMPTY_CLOUD, result, collection)
 
 
 def _export(

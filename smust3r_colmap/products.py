@@ -15,11 +15,9 @@ from typing import Literal, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.transform import Transform
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 
 # ----------------------------------------------------------------------------- import
@@ -441,3 +439,50 @@ EMPTY_CLOUD = PointCloud(xyz=np.empty((0, 3)), rgb=np.empty((0, 3), np.uint8))
 def largest_first(scenes: Sequence[Scene]) -> tuple[Scene, ...]:
     """Scenes by falling number of images; ties keep their order."""
     return tuple(sorted(scenes, key=len, reverse=True))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TriedAlignment:
+    """Two pieces for which no transform was found, and why."""
+
+    target: int
+    source: int
+    evidence: str
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Edges:
+    """All alignments of a run, accepted or not, and the pairs that gave none."""
+
+    alignments: tuple[SegmentAlignment, ...]
+    failures: tuple[TriedAlignment, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MissingOutput:
+    """A part of the result that could not be written, and why."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Written:
+    """What a format has written.
+
+    Args:
+        name: the file or folder, below the output folder.
+        remarks: what the user should know of it, such as what was left out.
+    """
+
+    name: str
+    remarks: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outputs:
+    """What came of several formats: which could not be written, and the remarks of the others."""
+
+    missing: tuple[MissingOutput, ...]
+    remarks: tuple[str, ...]

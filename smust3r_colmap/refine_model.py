@@ -17,20 +17,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
 from smust3r_colmap.alignment.from_poses import align_poses
-from smust3r_colmap.estimators.sim3 import evenly_chosen
-from smust3r_colmap.features.sift import match_pairs
-from smust3r_colmap.features.stage import describe_images, features_of_run
+from smust3r_colmap.colmap.model_files import MODEL_FILES, refuse_names_text_cannot_hold
 from smust3r_colmap.config import RunConfig
 from smust3r_colmap.errors import ConfigError, DegenerateAlignmentError
+from smust3r_colmap.estimators.robust import evenly_chosen
+from smust3r_colmap.execution.progress import Reporter
+from smust3r_colmap.execution.stage_clock import StageClock, peak_memory_bytes
 from smust3r_colmap.execution.task_pool import usable_cores
-from smust3r_colmap.exporters.colmap_sparse import MODEL_FILES, refuse_names_text_cannot_hold
+from smust3r_colmap.exporters.registry import FORMATS, FormatSettings, write_where_possible
 from smust3r_colmap.exporters.tum_trajectory import write_tum
-from smust3r_colmap.exporters.registry import FORMATS, FormatSettings, Outputs, write_where_possible
-from smust3r_colmap.storage.finished_run import FinishedRun, begin_stages, write_finished
+from smust3r_colmap.features.matching import match_pairs
+from smust3r_colmap.features.pairs import alike_pairs, neighbouring_pairs
+from smust3r_colmap.features.stage import describe_images, features_of_run
+from smust3r_colmap.geometry.arrays import IntArray, Pair
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.importers.colmap_model import ForeignModel, read_colmap_model
@@ -43,19 +45,14 @@ from smust3r_colmap.importers.image_folder import (
 )
 from smust3r_colmap.importers.masks import masks_of
 from smust3r_colmap.pipeline import masked_as_wanted, refinement_summaries
-from smust3r_colmap.products import FloatArray, ImageCollection, IntArray, PointCloud, RunFeatures, Scene, SegmentPiece
-from smust3r_colmap.execution.progress import Reporter
-from smust3r_colmap.features.correspondences import Pair
+from smust3r_colmap.products import ImageCollection, Outputs, PointCloud, RunFeatures, Scene, SegmentPiece
 from smust3r_colmap.refinement.stage import Refinement, refine, surfaces_of_clouds
-from smust3r_colmap.storage.run_directory import RunDirectory, key_of, write_json
-from smust3r_colmap.segmentation.windows import plan_windows
-from smust3r_colmap.execution.stage_clock import StageClock, peak_memory_bytes
-from smust3r_colmap.storage.image_scan import scan_changed_files
-from smust3r_colmap.storage.scenes import write_scenes
 from smust3r_colmap.report.summary import GraphSummary, ImageRemark, ModelSummary, RunSummary
-
-MAX_TURN_DEG = 60.0
-"""Of two cameras without points between them: what one sees straight ahead is beyond the edge of the other."""
+from smust3r_colmap.segmentation.windows import plan_windows
+from smust3r_colmap.storage.finished_run import FinishedRun, begin_stages, write_finished
+from smust3r_colmap.storage.image_scan import scan_changed_files
+from smust3r_colmap.storage.run_directory import RunDirectory, key_of, write_json
+from smust3r_colmap.storage.scenes import write_scenes
 
 MAX_ALIGNED = 500
 """Cameras that say how all have moved as a whole; the alignment compares every two of them, which takes 3.6 GB of
@@ -185,46 +182,6 @@ def _features(
                 features.database, usable, workers=workers, seed=config.seed, log_file=run.native_log, stage=stage
             )
     return features
-
-
-def alike_pairs(
-    descriptors: npt.NDArray[np.float32], num_posed: int, *, per_image: int, exhaustive_below: int
-) -> tuple[Pair, ...]:
-    """Pairs (i < j) of each image that is to be placed with those most like it; of few images, with all.
-
-    Args:
-        descriptors: (N, D) unit vectors. num_posed: images from this one on are to be placed.
-        per_image: most similar others of each, with and without a pose.
-        exhaustive_below: up to so many images every pair is taken.
-    """
-    n = len(descriptors)
-    wanted = n - 1 if n <= exhaustive_below else min(per_image, n - 1)
-    similarity = descriptors[num_posed:] @ descriptors.T
-    similarity[np.arange(n - num_posed), np.arange(num_posed, n)] = -np.inf
-    most_alike = np.argsort(-similarity, axis=1, kind="stable")[:, :wanted]
-    return tuple(sorted({(min(i, j), max(i, j)) for i, row in enumerate(most_alike.tolist(), num_posed) for j in row}))
-
-
-def neighbouring_pairs(cam_from_world: FloatArray, *, per_image: int, exhaustive_below: int) -> tuple[Pair, ...]:
-    """Pairs (i < j) of cameras that stand near each other and look the same way; of few images, all.
-
-    Args:
-        cam_from_world: (N, 3, 4).
-        per_image: nearest others of each that differ by less than ``MAX_TURN_DEG``.
-        exhaustive_below: up to so many images every pair is taken.
-    """
-    n = len(cam_from_world)
-    if n <= exhaustive_below:
-        return tuple((i, j) for i in range(n) for j in range(i + 1, n))
-    centres, forward = invert_rigid(cam_from_world)[:, :, 3], cam_from_world[:, 2, :3]
-    pairs: set[Pair] = set()
-    for i in range(n):
-        distance = np.linalg.norm(centres - centres[i], axis=1)
-        distance[forward @ forward[i] < np.cos(np.deg2rad(MAX_TURN_DEG))] = np.inf
-        distance[i] = np.inf
-        nearest = np.argsort(distance, kind="stable")[:per_image]
-        pairs |= {(min(i, j), max(i, j)) for j in nearest[np.isfinite(distance[nearest])].tolist()}
-    return tuple(sorted(pairs))
 
 
 def _refine(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from finished_runs import Example
+    from helpers.finished_runs import Example
 
 ONE_OF_SEVERAL = "PYTEST_XDIST_WORKER" in os.environ
 SLOW_FILES = (
@@ -22,6 +23,8 @@ SLOW_FILES = (
     "test_refine_command.py",
 )
 """From half a minute up, the slowest first."""
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 
 if ONE_OF_SEVERAL:
     # Before numpy and torch are loaded: threads of several processes would wait for each other on the same cores.
@@ -67,6 +70,6 @@ def quiet_pycolmap() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def finished_example(tmp_path_factory: pytest.TempPathFactory) -> Example:
     """A small finished run; it is only read, tests that change something copy it."""
-    from finished_runs import make_finished_run  # noqa: PLC0415  (heavy, and few tests need it)
+    from helpers.finished_runs import make_finished_run  # noqa: PLC0415  (heavy, and few tests need it)
 
     return make_finished_run(tmp_path_factory.mktemp("finished"))

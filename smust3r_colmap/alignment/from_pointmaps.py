@@ -14,14 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.estimators.sim3 import PieceFit, evenly_chosen
-from smust3r_colmap.alignment.seen_points import align_seen_points
-from smust3r_colmap.estimators.confidence import reweighted
+from smust3r_colmap.alignment.seen_points import PieceFit, align_seen_points
 from smust3r_colmap.config import AlignmentConfig, ConfidenceWeighting
 from smust3r_colmap.errors import DegenerateAlignmentError, ReconstructionError
+from smust3r_colmap.estimators.confidence import reweighted
+from smust3r_colmap.estimators.robust import evenly_chosen
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.products import DenseMaps, SegmentPiece
-
-FloatArray = npt.NDArray[np.float64]
 
 NUM_PIXELS = 8_000
 """Correspondences per pair of pieces; 5,000 to 20,000 measured alike, and the cost is 0.08 CPU s."""

@@ -13,22 +13,17 @@ from typing import Literal
 
 import numpy as np
 
-from smust3r_colmap.estimators.sim3 import (
-    CAUCHY_TUNING,
-    MAD_TO_SIGMA,
-    REDESCENDING_ITERATIONS,
-    TRIMMING_ROUNDS,
-    TUKEY_TUNING,
-    PieceFit,
-    evenly_chosen,
-)
+from smust3r_colmap.alignment.seen_points import PieceFit
 from smust3r_colmap.config import RobustKernel
 from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.estimators.robust import CAUCHY_TUNING, MAD_TO_SIGMA, TRIMMING_ROUNDS, TUKEY_TUNING, evenly_chosen
+from smust3r_colmap.estimators.sim3 import REDESCENDING_ITERATIONS
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.so3 import angles_between, nearest_rotation, skew
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.products import FloatArray, SegmentPiece, TransformEstimate
+from smust3r_colmap.products import SegmentPiece, TransformEstimate
 
 PoseGroup = Literal["sim3", "se3"]
 

@@ -10,14 +10,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.estimators.sim3 import PieceFit
-from smust3r_colmap.alignment.seen_points import align_seen_points
+from smust3r_colmap.alignment.seen_points import PieceFit, align_seen_points
 from smust3r_colmap.config import AlignmentConfig
 from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.products import SegmentPiece, Tracks
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 MAX_VOTES = 5
 """Shared observations of a point pair that count: more of them make the pairing no surer."""

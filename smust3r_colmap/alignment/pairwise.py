@@ -20,19 +20,22 @@ import numpy.typing as npt
 from smust3r_colmap.alignment.from_pointmaps import align_pointmaps
 from smust3r_colmap.alignment.from_poses import align_poses
 from smust3r_colmap.alignment.from_tracks import align_tracks, match_links, point_depths
-from smust3r_colmap.estimators.sim3 import PieceFit, evenly_chosen
+from smust3r_colmap.alignment.seen_points import PieceFit
 from smust3r_colmap.alignment.uncertainty import honest_information, overlap_centre
 from smust3r_colmap.config import AlignmentConfig
 from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.estimators.robust import evenly_chosen
 from smust3r_colmap.geometry.groups import GROUPS, embed
 from smust3r_colmap.geometry.so3 import angles_between
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import (
     DenseMaps,
+    Edges,
     FeatureLinks,
     SegmentAlignment,
     SegmentPiece,
     TransformEstimate,
+    TriedAlignment,
 )
 
 logger = logging.getLogger(__name__)
@@ -54,24 +57,6 @@ DEPTH_IMAGES = 8
 """Maps looked at for the median depth of a piece."""
 MAX_CAMERA_TURN_DEG = 10.0
 """Median difference in rotation of the shared cameras after the fit; sound edges have 0.1 to 1.8."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TriedAlignment:
-    """Two pieces for which no transform was found, and why."""
-
-    target: int
-    source: int
-    evidence: str
-    reason: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class Edges:
-    """All alignments of a run, accepted or not, and the pairs that gave none."""
-
-    alignments: tuple[SegmentAlignment, ...]
-    failures: tuple[TriedAlignment, ...]
 
 
 def align_pieces(

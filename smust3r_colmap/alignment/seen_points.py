@@ -11,27 +11,20 @@ import logging
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from smust3r_colmap.estimators.affine3 import estimate_affine3
-from smust3r_colmap.estimators.sim3 import (
-    PieceFit,
-    consensus_sim3,
-    estimate_sim3,
-    evenly_chosen,
-    homogeneous,
-    point_distances,
-)
-from smust3r_colmap.estimators.sl4 import estimate_sl4
 from smust3r_colmap.config import RobustKernel, TransformGroup
 from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.estimators.affine3 import estimate_affine3
+from smust3r_colmap.estimators.robust import evenly_chosen
+from smust3r_colmap.estimators.sim3 import consensus_sim3, estimate_sim3, homogeneous, point_distances
+from smust3r_colmap.estimators.sl4 import estimate_sl4
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import TransformEstimate
 
 logger = logging.getLogger(__name__)
 
-FloatArray = npt.NDArray[np.float64]
 
 CONSENSUS_ERROR = 0.05
 """Residual over depth that counts as agreement at the start: sound overlaps have medians up to 0.046,
@@ -241,3 +234,25 @@ def absurdity(b_from_a: Transform, points_a: FloatArray) -> str:
     if not anisotropy <= MAX_ANISOTROPY:
         return f"it stretches {anisotropy:.2f} times more one way than another, at most {MAX_ANISOTROPY:.0f}"
     return ""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PieceFit:
+    """``target_from_source`` between two pieces, with what tells a sound fit from a broken one.
+
+    Args:
+        estimate: the transform and the evidence of the solver.
+        num_correspondences: pairs of points found, before any was left out as wrong.
+        relative_residual: median over all of them of the residual divided by the depth.
+        fallback: why the transform is of Sim(3) although a larger group was asked for, or empty.
+    """
+
+    estimate: TransformEstimate
+    num_correspondences: int
+    relative_residual: float
+    fallback: str = ""
+
+    @property
+    def inlier_share(self) -> float:
+        """Share of the pairs found that lie within three robust standard deviations."""
+        return self.estimate.num_inliers / self.num_correspondences

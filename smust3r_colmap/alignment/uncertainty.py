@@ -28,8 +28,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.products import FloatArray, SegmentPiece, TransformEstimate
+from smust3r_colmap.products import SegmentPiece, TransformEstimate
 
 OBSERVATIONS_PER_IMAGE = 0.1
 """Independent observations that a shared image is worth, be it as 300 pixels or as one camera."""

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from smust3r_colmap.config import RunConfig
+from smust3r_colmap.execution.progress import Reporter
 from smust3r_colmap.products import (
     DenseMaps,
     FeatureLinks,
@@ -24,7 +25,6 @@ from smust3r_colmap.products import (
     SegmentPiece,
     SegmentReconstruction,
 )
-from smust3r_colmap.execution.progress import Reporter
 from smust3r_colmap.storage.run_directory import RunDirectory
 
 

@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from smust3r_colmap.backbones.base import BackboneResult
 from smust3r_colmap.errors import CheckpointError
+from smust3r_colmap.execution.progress import Reporter, Stage
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import (
     DenseMaps,
@@ -29,7 +30,7 @@ from smust3r_colmap.products import (
     SegmentReconstruction,
     UnregisteredImage,
 )
-from smust3r_colmap.execution.progress import Reporter, Stage
+from smust3r_colmap.storage.dense_maps import ImageMaps, StoredMaps, write_maps
 from smust3r_colmap.storage.run_directory import (
     RunDirectory,
     StageFolder,
@@ -39,7 +40,6 @@ from smust3r_colmap.storage.run_directory import (
     write_arrays,
     write_json,
 )
-from smust3r_colmap.storage.dense_maps import ImageMaps, StoredMaps, write_maps
 
 MIN_IMAGES = 2
 """Of a piece; one image has no baseline and ties nothing."""

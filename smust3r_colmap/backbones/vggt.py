@@ -32,11 +32,11 @@ from smust3r_colmap.backbones.feed_forward import (
     fingerprint_of,
 )
 from smust3r_colmap.errors import CheckpointError, ConfigError, ImageError, MissingDependencyError, ReconstructionError
+from smust3r_colmap.execution.progress import Reporter, Stage
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.importers.images import load_rgb
 from smust3r_colmap.products import ImageCollection, Segment, SourceImage, UnregisteredImage
-from smust3r_colmap.execution.progress import Reporter, Stage
 from smust3r_colmap.storage.dense_maps import ImageMaps
 
 PATCH_PX = 14

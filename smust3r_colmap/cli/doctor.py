@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import platform
-import re
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +18,7 @@ from typing import Any
 
 from smust3r_colmap import __version__
 from smust3r_colmap.backbones.registry import OUR_PACKAGE, KnownBackbone, list_backbones
+from smust3r_colmap.errors import advice_for
 from smust3r_colmap.execution.task_pool import usable_cores
 
 _IMPORT_TIMEOUT_S = 120.0
@@ -71,19 +71,6 @@ except CheckpointError as error:
 
 # The backbone that works without anything else; the others may be broken.
 _NEEDED_BACKBONE = "classical"
-
-# Where the name to import is not the name to install.
-_DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow"}
-
-# Start of a shared library's name, and the Debian or Ubuntu package that has it.
-_SYSTEM_PACKAGES = {
-    "libusb-1.0": "libusb-1.0-0",
-    "libGL": "libgl1",
-    "libEGL": "libegl1",
-    "libgomp": "libgomp1",
-    "libX11": "libx11-6",
-    "libglib": "libglib2.0-0",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,23 +159,6 @@ def examine() -> Diagnosis:
         memory_bytes=_memory_bytes(),
         checks=tuple(checks),
     )
-
-
-def advice_for(stderr: str) -> str:
-    """Why an import failed and what to install, from what the child process wrote; its last line is the exception."""
-    ours = re.fullmatch(r"smust3r_colmap\.errors\.\w+: (.+)", (stderr.strip().splitlines() or [""])[-1])
-    if ours:
-        return ours[1]
-    library = re.search(r"(lib[\w.+-]+?\.so[\w.]*): cannot open shared object file", stderr)
-    if library:
-        owner = next((owner for start, owner in _SYSTEM_PACKAGES.items() if library[1].startswith(start)), None)
-        remedy = f"install the system package {owner} (Debian's name)" if owner else "install the package that has it"
-        return f"the system library {library[1]} is missing; {remedy}"
-    missing = re.search(r"No module named '([\w]+)", stderr)
-    if missing:
-        return f"{missing[1]} is not installed; pip install {_DISTRIBUTIONS.get(missing[1], missing[1])}"
-    lines = stderr.strip().splitlines()
-    return f"cannot be imported: {lines[-1] if lines else 'no message'}"
 
 
 def _check_package(distribution: str, program: str) -> Check:

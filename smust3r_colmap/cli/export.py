@@ -123,8 +123,8 @@ def _settings(command: Export) -> FormatSettings:
 def _check_before(run: RunDirectory, finished: FinishedRun, names: Sequence[str], settings: FormatSettings) -> None:
     """Whatever can be refused before the first format is written."""
     from smust3r_colmap.exporters.registry import FORMATS  # noqa: PLC0415  (as above)
-    from smust3r_colmap.storage.finished_run import check_images, check_masks_of_run  # noqa: PLC0415
     from smust3r_colmap.importers.image_folder import check_output_not_inside  # noqa: PLC0415
+    from smust3r_colmap.storage.finished_run import check_images, check_masks_of_run  # noqa: PLC0415
 
     if any(FORMATS[name].reads_images for name in names):
         check_images(run, finished)

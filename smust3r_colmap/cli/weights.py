@@ -16,9 +16,6 @@ from urllib.parse import urlsplit
 
 import tyro
 
-from smust3r_colmap.config import Must3rConfig
-from smust3r_colmap.errors import CheckpointError, ConfigError
-from smust3r_colmap.execution.progress import Reporter
 from smust3r_colmap.backbones.weights.cache import (
     CONVERTED_SUFFIX,
     WEIGHTS_VARIABLE,
@@ -41,6 +38,9 @@ from smust3r_colmap.backbones.weights.catalogue import (
     official,
 )
 from smust3r_colmap.backbones.weights.checksum import verify
+from smust3r_colmap.config import Must3rConfig
+from smust3r_colmap.errors import CheckpointError, ConfigError
+from smust3r_colmap.execution.progress import Reporter
 
 _EXIT_GOOD = 0
 _EXIT_FAILED = 1

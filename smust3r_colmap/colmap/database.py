@@ -9,6 +9,7 @@ The next module to read is ``trainer_folder``.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -16,10 +17,13 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
+from smust3r_colmap.errors import StorageError
+from smust3r_colmap.geometry.arrays import FloatArray, Pair
 from smust3r_colmap.geometry.camera import Intrinsics
-from smust3r_colmap.products import FloatArray, ImageCollection
+from smust3r_colmap.products import ImageCollection
 
-Pair = tuple[int, int]
+_PATIENCE_S = 30.0
+_PAUSE_S = 0.02
 
 
 def write_colmap_database(
@@ -84,3 +88,60 @@ def _two_view_geometry(matches: npt.NDArray[np.uint32], j_from_i: FloatArray | N
         geometry.cam2_from_cam1 = pycolmap.Rigid3d(j_from_i)
         geometry.E = pycolmap.essential_matrix_from_pose(geometry.cam2_from_cam1)
     return geometry
+
+
+def open_database(path: Path) -> pycolmap.Database:
+    """The run's database, which several processes may open at the same moment.
+
+    pycolmap writes when it opens and does not wait for a lock: with two processes one opening in sixty
+    fails with "database is locked". So it is tried again.
+
+    Raises:
+        StorageError: it cannot be opened for ``_PATIENCE_S`` seconds, or is no database.
+    """
+    give_up_s = time.monotonic() + _PATIENCE_S
+    while True:
+        try:
+            return pycolmap.Database.open(path)
+        except RuntimeError as error:
+            if time.monotonic() > give_up_s:
+                raise StorageError(
+                    f"{path}: cannot be opened for {_PATIENCE_S:.0f} s ({error}); is it held by another process, or "
+                    f"damaged? Delete {path.parent} or start with --fresh"
+                ) from error
+            time.sleep(_PAUSE_S)
+
+
+def create_database(path: Path, collection: ImageCollection) -> None:
+    """Write cameras, rigs, frames and images with our ids, unless the database has them already."""
+    with open_database(path) as database:
+        if database.num_frames() == len(collection):  # an image's frame is written last
+            return
+        database.clear_all_tables()
+        with pycolmap.DatabaseTransaction(database):
+            write_images(database, collection.cameras, [(i, image.camera) for i, image in enumerate(collection.images)])
+
+
+def write_images(database: pycolmap.Database, cameras: Sequence[Intrinsics], images: Iterable[tuple[int, int]]) -> None:
+    """Write all ``cameras`` and the images given as (index, camera index), one rig and frame each.
+
+    Inside the run an image goes by its number: pycolmap's lists of pairs are text and would cut
+    names at the first blank.
+    """
+    for index, intrinsics in enumerate(cameras):
+        camera = intrinsics.colmap_camera(index + 1)
+        database.write_camera(camera, use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=index + 1)
+        rig.add_ref_sensor(camera.sensor_id)
+        database.write_rig(rig, use_rig_id=True)
+    for index, camera_index in images:
+        image = pycolmap.Image(name=internal_name(index), camera_id=camera_index + 1, image_id=index + 1)
+        database.write_image(image, use_image_id=True)
+        frame = pycolmap.Frame(frame_id=index + 1, rig_id=camera_index + 1)
+        frame.add_data_id(image.data_id)
+        database.write_frame(frame, use_frame_id=True)
+
+
+def internal_name(index: int) -> str:
+    """The name of an image in the databases of a run."""
+    return f"{index:08d}"

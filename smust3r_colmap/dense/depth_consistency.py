@@ -23,15 +23,14 @@ import pycolmap
 from scipy import sparse
 
 from smust3r_colmap.errors import InputError
+from smust3r_colmap.estimators.weighted_median import weighted_median
+from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.products import DepthMaps
-from smust3r_colmap.estimators.weighted_median import weighted_median
 
 logger = logging.getLogger(__name__)
 
-FloatArray = npt.NDArray[np.float64]
 FloatMap = npt.NDArray[np.float32]
-IntArray = npt.NDArray[np.int64]
 AnyFloats = npt.NDArray[np.floating[Any]]
 
 DEPTH_EDGE = 0.03

@@ -9,14 +9,14 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.estimators.sim3 import Loss, Pairs, affine_matrix, fit_robustly, usable_pairs
 from smust3r_colmap.config import RobustKernel
 from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.estimators.robust import Loss
+from smust3r_colmap.estimators.sim3 import Pairs, affine_matrix, fit_robustly, usable_pairs
 from smust3r_colmap.geometry.affine3 import Affine3
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import TransformEstimate
-
-FloatArray = npt.NDArray[np.float64]
 
 COPLANAR_RATIO = 1e-6
 """Third over first singular value of the centred points below which they are a plane to rounding."""

@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from smust3r_colmap.config import ConfidenceWeighting
-
-FloatArray = npt.NDArray[np.float64]
+from smust3r_colmap.geometry.arrays import FloatArray
 
 HALF_CONFIDENCE_DISAGREEMENT = 0.05
 """Depth difference over depth at which half of the confidence is left, in relative mode: sound overlaps

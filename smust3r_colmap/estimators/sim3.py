@@ -19,22 +19,14 @@ import pycolmap
 
 from smust3r_colmap.config import RobustKernel
 from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.estimators.robust import MAD_TO_SIGMA, TRIMMING_ROUNDS, Loss, evenly_chosen
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.so3 import nearest_rotation
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import TransformEstimate
 
-FloatArray = npt.NDArray[np.float64]
-
-MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a Gaussian over its median absolute deviation."""
-TRIMMING_ROUNDS = 6
-"""Of the median residual; each takes off what the one before no longer hides, and 6 rest within 1 %."""
-CAUCHY_TUNING = 2.385
-"""Where the Cauchy weight is 1/2, in robust standard deviations: 95 % efficient on Gaussian noise."""
-TUKEY_TUNING = 4.685
-"""Where Tukey's weight reaches 0, in robust standard deviations: 95 % efficient on Gaussian noise."""
 HUBER_ITERATIONS = 5
 """As in VGGT-Long, whose Huber IRLS the paper takes over."""
 REDESCENDING_ITERATIONS = 100
@@ -256,39 +248,6 @@ def transformed(b_from_a: FloatArray, points_a: FloatArray) -> FloatArray:
 
 
 # ------------------------------------------------------------------------- the iteration
-@dataclass(frozen=True, kw_only=True)
-class Loss:
-    """A kernel with its constant; what `estimate_sim3` says of both.
-
-    Args:
-        kernel, huber_delta: as there.
-        squared: take the square of a redescending kernel's weight, for refits that see nothing but
-            products of two residuals (see ``affine``).
-    """
-
-    kernel: RobustKernel
-    huber_delta: float = 0.1
-    squared: bool = False
-
-    def __post_init__(self) -> None:
-        if self.kernel == "huber" and not self.huber_delta > 0:
-            raise ValueError(f"huber_delta {self.huber_delta} must be positive")
-
-    def weights(self, residuals: FloatArray, sigma: float) -> FloatArray:
-        """(N,) in [0, 1]: the derivative of the loss over the residual."""
-        weights: FloatArray
-        if self.kernel == "huber":
-            return self.huber_delta / np.maximum(residuals, self.huber_delta)
-        if self.kernel == "tukey":
-            weights = np.maximum(1 - (residuals / (TUKEY_TUNING * sigma)) ** 2, 0.0) ** 2
-        else:
-            weights = 1 / (1 + (residuals / (CAUCHY_TUNING * sigma)) ** 2)
-        return weights**2 if self.squared else weights
-
-    @property
-    def stages(self) -> tuple[Loss, ...]:
-        """Itself, and what has to converge before it."""
-        return (Loss(kernel="cauchy", squared=self.squared), self) if self.kernel == "tukey" else (self,)
 
 
 class Refit(Protocol):
@@ -496,30 +455,3 @@ def point_distances(b_from_a: Transform, points_a: FloatArray, points_b: FloatAr
     """(N,) distances in frame b between transformed and given points; infinite where there is no image."""
     distances = np.linalg.norm(points_b - b_from_a.apply(points_a), axis=1)
     return np.where(np.isnan(distances), np.inf, distances)
-
-
-def evenly_chosen(count: int, limit: int) -> npt.NDArray[np.int64]:
-    """At most ``limit`` of the rows 0 .. count - 1, evenly spread, ascending, without repeats."""
-    return np.arange(count) if count <= limit else np.arange(limit) * count // limit
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PieceFit:
-    """``target_from_source`` between two pieces, with what tells a sound fit from a broken one.
-
-    Args:
-        estimate: the transform and the evidence of the solver.
-        num_correspondences: pairs of points found, before any was left out as wrong.
-        relative_residual: median over all of them of the residual divided by the depth.
-        fallback: why the transform is of Sim(3) although a larger group was asked for, or empty.
-    """
-
-    estimate: TransformEstimate
-    num_correspondences: int
-    relative_residual: float
-    fallback: str = ""
-
-    @property
-    def inlier_share(self) -> float:
-        """Share of the pairs found that lie within three robust standard deviations."""
-        return self.estimate.num_inliers / self.num_correspondences

@@ -13,12 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from smust3r_colmap.config import RobustKernel
+from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.estimators.affine3 import refuse_plane
+from smust3r_colmap.estimators.robust import Loss, evenly_chosen
 from smust3r_colmap.estimators.sim3 import (
     CONSENSUS_SAMPLE,
-    Loss,
     Pairs,
-    evenly_chosen,
     fit_robustly,
     homogeneous,
     right_jacobians,
@@ -26,15 +27,10 @@ from smust3r_colmap.estimators.sim3 import (
     transformed,
     usable_pairs,
 )
-from smust3r_colmap.config import RobustKernel
-from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.geometry.arrays import BoolArray, FloatArray
 from smust3r_colmap.geometry.sl4 import SL4
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import TransformEstimate
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 MAX_PAIRS = 10_000
 """Rows that take part, however many are offered; with more, the model is wrong before the noise tells."""

@@ -12,29 +12,19 @@ from the orientations. ``Evaluation.alignment`` says which of the two it was.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import groupby
-from pathlib import Path, PurePosixPath
 
 import numpy as np
-import numpy.typing as npt
-import pycolmap
 from scipy.spatial.transform import Rotation
 
-from smust3r_colmap.errors import DegenerateAlignmentError, InputError
+from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.estimators.similarity import fit_similarity, transposed
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import Sim3
-from smust3r_colmap.geometry.so3 import nearest_rotation
 
-FloatArray = npt.NDArray[np.float64]
 Trajectory = Mapping[str, FloatArray]
-
-# Centres spread less than this across their main direction, relative to along it, do not determine
-# the roll: an error of 0.1 % of the length would turn it by more than a degree.
-_MIN_RELATIVE_WIDTH = 0.05
-# Below this the spread is rounding.
-_MIN_RELATIVE_EXTENT = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,10 +94,10 @@ def compare_trajectories(
         )
     estimated = _stacked(world_from_cam_estimated, names, "estimate")
     reference = _stacked(world_from_cam_reference, names, "reference")
-    reference_from_estimated, alignment = _align(estimated, reference)
+    reference_from_estimated, alignment = fit_similarity(estimated, reference)
     moved = reference_from_estimated.move_cameras(estimated)
     distances = np.linalg.norm(moved[:, :, 3] - reference[:, :, 3], axis=1)
-    angles_deg = np.rad2deg(Rotation.from_matrix(_transposed(reference[:, :, :3]) @ moved[:, :, :3]).magnitude())
+    angles_deg = np.rad2deg(Rotation.from_matrix(transposed(reference[:, :, :3]) @ moved[:, :, :3]).magnitude())
     return Evaluation(
         reference_from_estimated=reference_from_estimated,
         alignment=alignment,
@@ -145,144 +135,6 @@ def _largest_gap(estimated: Trajectory, reference: Trajectory) -> int:
 
 
 # -------------------------------------------------------------------------- alignment
-def _align(estimated: FloatArray, reference: FloatArray) -> tuple[Sim3, str]:
-    """``reference_from_estimated`` of poses (N, 3, 4) and how it was found.
-
-    Source: Umeyama 1991, "Least-squares estimation of transformation parameters between two point
-    patterns", eqs. 34-43.
-    """
-    mean_est, mean_ref = estimated[:, :, 3].mean(axis=0), reference[:, :, 3].mean(axis=0)
-    centred_est, centred_ref = estimated[:, :, 3] - mean_est, reference[:, :, 3] - mean_ref
-    width_est, _ = _spread(centred_est, mean_est, "estimate")
-    width_ref, line_ref = _spread(centred_ref, mean_ref, "reference")
-
-    rotation = nearest_rotation(centred_ref.T @ centred_est)  # of eq. 38, transposed roles
-    alignment = "centres"
-    if min(width_est, width_ref) < _MIN_RELATIVE_WIDTH:
-        rotation = _roll_from_orientations(rotation, line_ref, estimated[:, :, :3], reference[:, :, :3])
-        alignment = "centres, roll from orientations"
-
-    # The best scale for this rotation; for Umeyama's it is eq. 42.
-    scale = np.sum(centred_ref * (centred_est @ rotation.T)) / np.sum(centred_est**2)
-    if scale <= 0:
-        raise DegenerateAlignmentError(f"the camera centres fit best at scale {scale:.2g}: they have nothing in common")
-    translation = mean_ref - scale * rotation @ mean_est  # eq. 41
-    return Sim3(scale=np.asarray(scale), rotation=rotation, translation=translation), alignment
-
-
-def _spread(centred: FloatArray, mean: FloatArray, which: str) -> tuple[float, FloatArray]:
-    """Width of the centres relative to their length, and the direction (3,) of the length."""
-    _, lengths, directions = np.linalg.svd(centred, full_matrices=False)
-    if lengths[0] <= _MIN_RELATIVE_EXTENT * np.sqrt(len(centred)) * (1 + np.linalg.norm(mean)):
-        raise DegenerateAlignmentError(f"{which}: all {len(centred)} camera centres coincide")
-    return float(lengths[1] / lengths[0]), directions[0]
-
-
-def _roll_from_orientations(
-    rotation: FloatArray, line_ref: FloatArray, rotations_est: FloatArray, rotations_ref: FloatArray
-) -> FloatArray:
-    """``rotation`` turned about the unit vector ``line_ref`` until the orientations agree best.
-
-    The angle maximises sum_k tr(Rref_k^T Roll(angle) rotation Rest_k), the chordal mean restricted
-    to one axis. With Rodrigues' formula that is cos(angle) (tr M - a.M a) + sin(angle) (a.w) plus a
-    constant, where M = sum_k rotation Rest_k Rref_k^T and w is the axial vector of M^T - M.
-    """
-    m = np.einsum("ij,njk,nlk->il", rotation, rotations_est, rotations_ref)
-    w = np.array([m[1, 2] - m[2, 1], m[2, 0] - m[0, 2], m[0, 1] - m[1, 0]])
-    angle = np.arctan2(line_ref @ w, np.trace(m) - line_ref @ m @ line_ref)
-    rolled: FloatArray = Rotation.from_rotvec(angle * line_ref).as_matrix() @ rotation
-    return rolled
-
-
-def _transposed(rotations: FloatArray) -> FloatArray:
-    return np.swapaxes(rotations, -1, -2)
 
 
 # ---------------------------------------------------------------------------- readers
-def read_poses_txt(path: Path) -> dict[str, FloatArray]:
-    """``world_from_cam`` by name from lines ``image qw qx qy qz tx ty tz``; ``#`` begins a comment.
-
-    The quaternion and the centre are camera to world, OpenCV axes; quaternions are normalised.
-
-    Raises:
-        InputError: the file cannot be read, or a line is not as above, or a name comes twice.
-    """
-    needed = "needed image qw qx qy qz tx ty tz, all finite"
-    world_from_cams: dict[str, FloatArray] = {}
-    for number, line in enumerate(_text(path).splitlines(), start=1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        name, *words = line.split()
-        try:
-            numbers = np.array([float(word) for word in words])
-        except ValueError as error:
-            raise InputError(f"{path}, line {number}: {error}; {needed}") from error
-        if len(numbers) != 7 or not np.isfinite(numbers).all():
-            raise InputError(f"{path}, line {number}: {len(numbers)} numbers after the name; {needed}")
-        norm = np.linalg.norm(numbers[:4])
-        if abs(norm - 1) > 1e-3:
-            raise InputError(f"{path}, line {number}: the quaternion has length {norm:.4g}; needed 1")
-        if name in world_from_cams:
-            raise InputError(f"{path}, line {number}: {name} has a pose already")
-        qw, qx, qy, qz = numbers[:4]
-        world_from_cams[name] = np.column_stack([Rotation.from_quat([qx, qy, qz, qw]).as_matrix(), numbers[4:]])
-    return world_from_cams
-
-
-def read_reference_sparse(folder: Path) -> dict[str, FloatArray]:
-    """``world_from_cam`` by name of the registered images of a COLMAP model, binary or text.
-
-    Raises:
-        InputError: there is no readable model in the folder.
-    """
-    try:
-        model = pycolmap.Reconstruction(folder)
-    except (ValueError, RuntimeError, OSError) as error:
-        raise InputError(f"{folder}: not a COLMAP model: {str(error).splitlines()[0]}") from error
-    return {
-        image.name: np.asarray(image.cam_from_world().inverse().matrix(), dtype=np.float64)
-        for image in model.images.values()
-        if image.has_pose
-    }
-
-
-def read_transforms_json(path: Path) -> dict[str, FloatArray]:
-    """``world_from_cam`` by name from a nerfstudio or instant-ngp ``transforms.json``.
-
-    Its cameras have OpenGL axes (y up, z backward), which are turned to OpenCV's. A leading
-    ``images/`` is no part of the name.
-
-    Raises:
-        InputError: the file cannot be read, or a frame has no name or no rigid 4 x 4 matrix.
-    """
-    try:
-        frames = json.loads(_text(path))["frames"]
-        matrices = {_image_name(frame["file_path"]): frame["transform_matrix"] for frame in frames}
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: not a transforms.json: {type(error).__name__} {error}") from error
-    return {name: _opencv_pose(path, name, matrix) for name, matrix in matrices.items()}
-
-
-def _image_name(file_path: str) -> str:
-    """The name below the image folder; ``./images/a/1.jpg`` is ``a/1.jpg``."""
-    parts = PurePosixPath(file_path).parts
-    return str(PurePosixPath(*(parts[1:] if parts[:1] == ("images",) else parts)))
-
-
-def _opencv_pose(path: Path, name: str, matrix: object) -> FloatArray:
-    """(3, 4) pose with OpenCV axes from a 4 x 4 list with OpenGL axes."""
-    try:
-        pose = np.asarray(matrix, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{path}, {name}: transform_matrix is not numbers") from error
-    if pose.shape != (4, 4) or not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-3):
-        raise InputError(f"{path}, {name}: transform_matrix is not a rigid 4 x 4 matrix")
-    turned: FloatArray = pose[:3] * [1.0, -1.0, -1.0, 1.0]
-    return turned
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from error

@@ -8,10 +8,10 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
-from smust3r_colmap.execution.task_pool import living_children_cpu_s
 from smust3r_colmap.execution.progress import Reporter, Stage
-from smust3r_colmap.report.summary import StageSummary
+from smust3r_colmap.execution.task_pool import living_children_cpu_s
 
 
 class StageClock:
@@ -74,3 +74,20 @@ def peak_memory_bytes() -> int:
 def _cpu_s() -> float:
     times = os.times()
     return times.user + times.system + times.children_user + times.children_system + living_children_cpu_s()
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageSummary:
+    """What a stage cost.
+
+    Args:
+        name: as in the progress report.
+        wall_s: time that went by.
+        cpu_s: processor time, child processes included.
+        reused: everything was found finished by an earlier run.
+    """
+
+    name: str
+    wall_s: float
+    cpu_s: float
+    reused: bool

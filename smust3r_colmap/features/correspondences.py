@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-Pair = tuple[int, int]
+from smust3r_colmap.geometry.arrays import Pair
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -15,10 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_array
 
+from smust3r_colmap.geometry.arrays import FloatArray, Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
-from smust3r_colmap.products import FloatArray
-from smust3r_colmap.features.correspondences import Pair
 
 SAMPLES_PER_IMAGE = 64
 """Points that stand for what an image sees: an overlap is known to some 6 % then."""

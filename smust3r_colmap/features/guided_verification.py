@@ -17,12 +17,12 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from smust3r_colmap.features.sift import open_database
+from smust3r_colmap.colmap.database import open_database
+from smust3r_colmap.features.correspondences import Correspondences
+from smust3r_colmap.geometry.arrays import FloatArray, Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.geometry.so3 import skew
-from smust3r_colmap.products import FloatArray
-from smust3r_colmap.features.correspondences import Correspondences, Pair
 
 MIN_CONSENT = 0.4
 """Part of a pair's verified matches that must agree with the geometry; of look-alike places few do by chance."""

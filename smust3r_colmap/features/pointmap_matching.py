@@ -20,21 +20,23 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 from scipy.spatial import cKDTree
 
+from smust3r_colmap.features.correspondences import Correspondences
+from smust3r_colmap.features.patch_alignment import (
+    MAX_STRETCH,
+    MIN_CORRELATION,
+    PATCH_RADIUS,
+    align_patches,
+    num_levels,
+)
+from smust3r_colmap.geometry.arrays import BoolArray, Float32Array, FloatArray, IntArray, Pair, UInt8Array
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
-from smust3r_colmap.features.correspondences import Correspondences, Pair
 
 logger = logging.getLogger(__name__)
 
-FloatArray = npt.NDArray[np.float64]
-Float32Array = npt.NDArray[np.float32]
-ByteArray = npt.NDArray[np.uint8]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 CACHED_VIEWS = 32
 """Images in memory at a time, at 4/3 bytes a pixel; more than an image has partners as a rule, so that going
@@ -58,8 +60,6 @@ MIN_AGREEING = 15
 """Corners that must support it; COLMAP wants as many inliers of a pair."""
 MIN_AGREEING_SHARE = 0.4
 """Of the corners that were found: look-alike surfaces correlate here and there, but to no common motion."""
-PATCH_RADIUS = 6
-"""13 x 13 pixels: a corner with some surroundings, and still flat on most surfaces."""
 CORNER_BLOCK = 5
 """Side of the window whose gradients make a corner."""
 CORNER_DISTANCE = 4
@@ -85,18 +85,6 @@ SURFACE_JUMP = 0.05
 """Inverse depths that differ by more than this part belong to another surface."""
 SURFACE_SHARE = 0.6
 """Of the pixels round a corner that must lie on its surface. Less is an outline, whose background moves."""
-CAPTURE_PX = 4.0
-"""From how far the alignment of a patch finds home at one level of the pyramid."""
-MAX_STRETCH = 2.5
-"""Of a patch between two images, in any direction, and its reciprocal; beyond, one has details the other lacks."""
-MIN_CORRELATION = 0.8
-"""Normalised, of two patches that show the same."""
-ITERATIONS = 8
-"""Of the alignment at each level of the pyramid."""
-CONVERGED_PX = 0.02
-"""A patch stops where its step is shorter; one that still makes five times as long ones has not settled."""
-LEAST_TEXTURE = 1e-6
-"""Determinant, of the squared gradients of a patch of length one; below it the patch has one direction at most."""
 
 
 # -------------------------------------------------------------------------------- input
@@ -124,7 +112,7 @@ class MappedView:
     intrinsics: Intrinsics
     depth: Callable[[], Float32Array]
     confidence: Callable[[], Float32Array]
-    grey: Callable[[], ByteArray]
+    grey: Callable[[], UInt8Array]
 
     def __post_init__(self) -> None:
         if self.cam_from_world.shape != (3, 4) or not np.isfinite(self.cam_from_world).all():
@@ -185,7 +173,7 @@ class _View:
 
     index: int
     camera: _Camera
-    pyramid: tuple[ByteArray, ...]
+    pyramid: tuple[UInt8Array, ...]
     inverse_depth: Float32Array
 
     @property
@@ -216,7 +204,7 @@ def _read(view: MappedView, min_confidence: float) -> _View:
     height, width = grey.shape
     camera = _Camera(cam_from_world=view.cam_from_world, intrinsics=view.intrinsics.resized(width, height))
     pyramid = [grey]
-    while len(pyramid) < _levels(camera.reach_px(WIDE_REACH)) and min(pyramid[-1].shape) > 4 * PATCH_RADIUS:
+    while len(pyramid) < num_levels(camera.reach_px(WIDE_REACH)) and min(pyramid[-1].shape) > 4 * PATCH_RADIUS:
         pyramid.append(np.asarray(cv2.pyrDown(pyramid[-1]), dtype=np.uint8))
     return _View(
         index=view.index,
@@ -361,7 +349,7 @@ def _evenly_ordered(xy: FloatArray, strength: Float32Array, known_xy: FloatArray
     return np.lexsort((-strength, turn[is_new]))
 
 
-def _corner_strength(grey: ByteArray) -> Float32Array:
+def _corner_strength(grey: UInt8Array) -> Float32Array:
     """(H, W) mean squared gradient along the direction where it is smaller, in squared grey levels per pixel.
 
     Source: Shi and Tomasi 1994, "Good Features to Track".
@@ -719,133 +707,3 @@ def _attach(tracks: _Tracks, view_a: _View, view_b: _View, in_a: _Keypoints, fou
 
 
 # ---------------------------------------------------------------------------- photometry
-@dataclass(frozen=True, kw_only=True, eq=False)
-class AlignedPatches:
-    """Where K patches of image a lie in image b.
-
-    Args:
-        xy_b: (K, 2). correlation: (K,) normalised, -1 where the alignment did not settle within its reach.
-    """
-
-    xy_b: FloatArray
-    correlation: FloatArray
-
-
-def align_patches(
-    pyramid_a: Sequence[ByteArray],
-    xy_a: FloatArray,
-    pyramid_b: Sequence[ByteArray],
-    xy_b: FloatArray,
-    b_from_a: FloatArray,
-    *,
-    reach_px: float,
-) -> AlignedPatches:
-    """Shift the warped patches of image a until they fit image b, whatever the brightness and the contrast.
-
-    From the coarsest level that the reach asks for, and both pyramids have, to the finest, by Gauss-Newton
-    with the gradients of the template; a level that fits worse where it ends than where it began is not
-    believed. Patches without texture correlate with nothing.
-
-    Args:
-        pyramid_a, pyramid_b: (H, W) uint8 and its halves by ``cv2.pyrDown``.
-        xy_a: (K, 2) centres of the patches in image a.
-        xy_b: (K, 2) first guesses in image b.
-        b_from_a: (K, 2, 2) how a patch lies in image b, invertible.
-        reach_px: largest distance from the first guess.
-
-    Source: Baker and Matthews 2004, "Lucas-Kanade 20 Years On", inverse compositional, for a translation.
-    """
-    xy = xy_b.copy()
-    correlation = np.full(len(xy), -1.0)
-    settled = np.zeros(len(xy), dtype=bool)
-    for level in reversed(range(min(_levels(reach_px), len(pyramid_a), len(pyramid_b)))):
-        # The centre of a first pixel is that of the next level's, and (0.5, 0.5) at every level.
-        template = _Template.cut(pyramid_a[level], (xy_a - 0.5) / 2**level, b_from_a)
-        end, correlation, settled = template.laid_on(pyramid_b[level], (xy - 0.5) / 2**level)
-        xy = end * 2**level + 0.5
-    within = settled & (np.linalg.norm(xy - xy_b, axis=1) <= reach_px)
-    return AlignedPatches(xy_b=xy, correlation=np.where(within, correlation, -1.0))
-
-
-def _levels(reach_px: float) -> int:
-    """Of a pyramid in whose coarsest image a reach is within ``CAPTURE_PX``; at least one."""
-    return 1 + max(0, int(np.ceil(np.log2(reach_px / CAPTURE_PX))))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Template:
-    """K patches of P pixels, and how they change when they are shifted over image b.
-
-    Args:
-        values: (K, P) of mean zero and length one; zero for a patch without texture.
-        offsets: (K, P, 2) of the pixels in image b.
-        descent: (K, 2, P) the shift that a difference in values asks for.
-    """
-
-    values: Float32Array
-    offsets: Float32Array
-    descent: Float32Array
-
-    @classmethod
-    def cut(cls, image: ByteArray, xy: FloatArray, b_from_a: FloatArray) -> _Template:
-        """At (K, 2), where the centre of the first pixel is (0, 0)."""
-        side = 2 * PATCH_RADIUS + 1
-        wide = _sampled(image, xy, _window(PATCH_RADIUS + 1)[None]).reshape(-1, side + 2, side + 2)
-        values, length = _normalised(wide[:, 1:-1, 1:-1].reshape(-1, side**2))
-        along_x = (wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]) / 2
-        along_y = (wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]) / 2
-        gradient_a = np.stack([along_x, along_y], axis=1).reshape(-1, 2, side**2) / length[:, None]
-        gradient = np.swapaxes(np.linalg.inv(b_from_a), 1, 2).astype(np.float32) @ gradient_a
-        # Values are normalised, so what changes their mean or length alone is no change.
-        gradient -= gradient.mean(axis=2, keepdims=True)
-        gradient -= (gradient @ values[:, :, None]) * values[:, None]
-        hessian = gradient @ np.swapaxes(gradient, 1, 2)
-        textured = np.asarray(np.linalg.det(hessian) > LEAST_TEXTURE)
-        hessian[~textured] = np.eye(2)
-        return cls(
-            values=np.where(textured[:, None], values, 0),
-            offsets=_window(PATCH_RADIUS) @ np.swapaxes(b_from_a, 1, 2).astype(np.float32),
-            descent=(np.linalg.inv(hessian) @ gradient).astype(np.float32),
-        )
-
-    def laid_on(self, image: ByteArray, begin: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Where (K, 2) the patches fit best from (K, 2) on, their correlation there (K,), and whether it settled."""
-        xy, step = begin.copy(), np.zeros(len(begin))
-        correlation = self._correlation(image, begin)
-        moving = np.arange(len(begin))
-        for _ in range(ITERATIONS):
-            values, _ = _normalised(_sampled(image, xy[moving], self.offsets[moving]))
-            shift = (self.descent[moving] @ (self.values[moving] - values)[:, :, None])[..., 0]
-            xy[moving] += shift
-            step[moving] = np.linalg.norm(shift, axis=1)
-            moving = moving[step[moving] > CONVERGED_PX]
-        end = self._correlation(image, xy)
-        better = end >= correlation
-        settled = step <= 5 * CONVERGED_PX
-        return np.where(better[:, None], xy, begin), np.where(better, end, correlation), settled
-
-    def _correlation(self, image: ByteArray, xy: FloatArray) -> FloatArray:
-        values, _ = _normalised(_sampled(image, xy, self.offsets))
-        return np.asarray(np.einsum("kp,kp->k", values, self.values), dtype=np.float64)
-
-
-def _window(radius: int) -> Float32Array:
-    """(P, 2) offsets of a square, row by row."""
-    along = np.arange(-radius, radius + 1, dtype=np.float32)
-    return np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
-
-
-def _sampled(image: ByteArray, xy: FloatArray, offsets: Float32Array) -> Float32Array:
-    """(K, P) grey levels at (K, 2) and offsets (K or 1, P, 2); beyond the border it goes on."""
-    if not len(xy):
-        return np.empty((0, offsets.shape[1]), np.float32)
-    at = xy.astype(np.float32)[:, None] + offsets
-    sampled = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(sampled, dtype=np.float32)
-
-
-def _normalised(patches: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """Mean zero and length one; and the length (K, 1) before, at least that of one grey level in one pixel."""
-    centred = patches - patches.mean(axis=1, keepdims=True)
-    length = np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1)
-    return centred / length, length

@@ -6,11 +6,12 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.features.vlad import FEATURES_PER_IMAGE, vlad_descriptors
-from smust3r_colmap.features.sift import create_database, extract_features, open_database
+from smust3r_colmap.colmap.database import create_database, open_database
 from smust3r_colmap.config import ClassicalConfig
-from smust3r_colmap.products import ImageCollection, RunFeatures
 from smust3r_colmap.execution.progress import Reporter
+from smust3r_colmap.features.sift import extract_features
+from smust3r_colmap.features.vlad import FEATURES_PER_IMAGE, vlad_descriptors
+from smust3r_colmap.products import ImageCollection, RunFeatures
 from smust3r_colmap.storage.run_directory import RunDirectory, key_of, read_arrays, write_arrays
 
 

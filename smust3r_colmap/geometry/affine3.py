@@ -11,11 +11,10 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.so3 import determinant, nearest_rotation
 from smust3r_colmap.geometry.transform import Transform, affine_parts, jacobian_of_linear
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

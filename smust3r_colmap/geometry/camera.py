@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-FloatArray = npt.NDArray[np.float64]
+from smust3r_colmap.geometry.arrays import FloatArray
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,10 +7,8 @@ The next module to read is ``sim3``.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
+from smust3r_colmap.geometry.arrays import BoolArray, FloatArray
 
 # Coefficients of the [7/7] Pade approximant of exp, and the 1-norm up to which it is exact to
 # rounding. Source: Higham 2005, "The scaling and squaring method for the matrix exponential

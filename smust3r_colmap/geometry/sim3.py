@@ -12,6 +12,7 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from smust3r_colmap.geometry.arrays import BoolArray, FloatArray
 from smust3r_colmap.geometry.so3 import (
     ORTHONORMALITY_TOLERANCE,
     angle_and_axis,
@@ -25,9 +26,6 @@ from smust3r_colmap.geometry.so3 import (
     unskew,
 )
 from smust3r_colmap.geometry.transform import Transform, affine_parts, jacobian_of_linear
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

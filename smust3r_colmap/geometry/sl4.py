@@ -12,9 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from smust3r_colmap.geometry.affine3 import Affine3
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.transform import Transform
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from smust3r_colmap.geometry.arrays import FloatArray
+
 ComplexArray = npt.NDArray[np.complexfloating[Any, Any]]
 
 ORTHONORMALITY_TOLERANCE = 1e-6

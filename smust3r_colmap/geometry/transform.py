@@ -19,11 +19,10 @@ import numpy as np
 import numpy.typing as npt
 from typing_extensions import Self
 
+from smust3r_colmap.geometry.arrays import BoolArray, FloatArray
 from smust3r_colmap.geometry.matrix_functions import log_exists, matrix_exp, matrix_log
 from smust3r_colmap.geometry.so3 import nearest_rotation
 
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 IndexPart = int | slice | EllipsisType | npt.NDArray[np.bool_] | npt.NDArray[np.integer[Any]] | Sequence[int] | None
 Index = IndexPart | tuple[IndexPart, ...]
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.geometry.so3 import angles_between
-from smust3r_colmap.products import FloatArray
 from smust3r_colmap.refinement.bundle_adjustment import (
     MIN_ANGLE_DEG,
     ModelFigures,

@@ -15,9 +15,9 @@ import numpy as np
 import pycolmap
 from scipy.sparse import csr_array
 
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.geometry.so3 import nearest_rotation
-from smust3r_colmap.products import FloatArray
 
 logger = logging.getLogger(__name__)
 

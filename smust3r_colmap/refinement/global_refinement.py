@@ -23,13 +23,25 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from smust3r_colmap.errors import ImageError
 from smust3r_colmap.colmap.database import write_colmap_database
-from smust3r_colmap.exporters.colmap_sparse import write_binary_checked
+from smust3r_colmap.colmap.model_files import write_binary_checked
+from smust3r_colmap.colmap.reconstruction import cameras_of, poses_of
+from smust3r_colmap.errors import ImageError
+from smust3r_colmap.features.correspondences import Correspondences, joined
+from smust3r_colmap.features.guided_verification import (
+    MIN_VERIFIED,
+    Consent,
+    MatchedFeatures,
+    ask_consent,
+    read_matched_features,
+)
+from smust3r_colmap.features.pointmap_matching import MappedView, match_by_pointmaps
+from smust3r_colmap.geometry.arrays import FloatArray, Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.importers.images import load_grey, load_rgb
-from smust3r_colmap.products import DepthMaps, FloatArray, ImageCollection, Scene
+from smust3r_colmap.products import DepthMaps, ImageCollection, Scene
+from smust3r_colmap.refinement.acceptance import MAX_ERROR_PX, StepReport, report_of, tried_step
 from smust3r_colmap.refinement.bundle_adjustment import (
     FUNCTION_TOLERANCE,
     ROUGH_TOLERANCE,
@@ -44,31 +56,13 @@ from smust3r_colmap.refinement.bundle_adjustment import (
     triangulate,
     weak_images,
 )
-from smust3r_colmap.refinement.mapper import (
-    LOOSE_PART,
-    TIGHT_PART,
-    Bench,
-    agrees,
-    cameras_of,
-    poses_of,
-    views_of,
-)
-from smust3r_colmap.refinement.registration import complete_model
-from smust3r_colmap.features.correspondences import Correspondences, Pair, joined
-from smust3r_colmap.features.guided_verification import (
-    MIN_VERIFIED,
-    Consent,
-    MatchedFeatures,
-    ask_consent,
-    read_matched_features,
-)
-from smust3r_colmap.refinement.subset_adjustment import adjust_on_part
-from smust3r_colmap.features.pointmap_matching import MappedView, match_by_pointmaps
+from smust3r_colmap.refinement.mapper import LOOSE_PART, TIGHT_PART, Bench, agrees, views_of
 from smust3r_colmap.refinement.principal_point import ask_for_principal_points
+from smust3r_colmap.refinement.registration import complete_model
 from smust3r_colmap.refinement.reregistration import NAME as REPLACEMENT
 from smust3r_colmap.refinement.reregistration import are_any_bent, place_bent_images_again
-from smust3r_colmap.refinement.acceptance import MAX_ERROR_PX, StepReport, report_of, tried_step
-from smust3r_colmap.storage.run_directory import StageFolder, write_json
+from smust3r_colmap.refinement.subset_adjustment import adjust_on_part
+from smust3r_colmap.storage.run_directory import DATABASE_FILE, MODEL_FOLDER, StageFolder, write_json
 
 logger = logging.getLogger(__name__)
 
@@ -86,7 +80,6 @@ matches hold lets go of them one by one."""
 LARGE = 400
 """Images beyond which parts are adjusted before the whole, and cameras on a part of the points first."""
 STAYED = "kept where it was"
-MODEL_FOLDER, DATABASE_FILE = "model", "database.db"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

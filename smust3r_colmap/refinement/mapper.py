@@ -14,15 +14,17 @@ from pathlib import Path
 import pycolmap
 
 from smust3r_colmap.colmap.database import write_colmap_database
+from smust3r_colmap.colmap.reconstruction import cameras_of, poses_of
+from smust3r_colmap.features.guided_verification import Consent, MatchedFeatures, View, ask_consent
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
-from smust3r_colmap.products import FloatArray, ImageCollection
+from smust3r_colmap.products import ImageCollection
 from smust3r_colmap.refinement.bundle_adjustment import (
     MANY_OBSERVATIONS,
     MIN_ANGLE_DEG,
     Tolerance,
     triangulator_options,
 )
-from smust3r_colmap.features.guided_verification import Consent, MatchedFeatures, View, ask_consent
 
 LOOSE_PART = 0.012
 """Epipolar and reprojection tolerance of the first round, as a part of the longer image side: what stitching leaves."""
@@ -177,16 +179,3 @@ def views_of(
         collection: says which image has which camera.
     """
     return {i: View(cam_from_world=pose, intrinsics=cameras[collection.images[i].camera]) for i, pose in poses.items()}
-
-
-def poses_of(model: pycolmap.Reconstruction) -> dict[int, FloatArray]:
-    """(3, 4) ``cam_from_world`` of the registered images by image index, ascending."""
-    return {i - 1: model.image(i).cam_from_world().matrix() for i in sorted(model.reg_image_ids())}
-
-
-def cameras_of(model: pycolmap.Reconstruction, priors: Sequence[Intrinsics]) -> tuple[Intrinsics, ...]:
-    """The intrinsics by camera index; ``priors`` serve for cameras that the model lacks."""
-    return tuple(
-        Intrinsics.from_colmap(model.camera(index + 1)) if index + 1 in model.cameras else prior
-        for index, prior in enumerate(priors)
-    )

@@ -13,7 +13,7 @@ import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
-from smust3r_colmap.features.correspondences import Pair
+from smust3r_colmap.geometry.arrays import Pair
 
 STRONG_MATCHES = 30
 """Verified matches of a pair that may speak against the model; COLMAP's own bar for registration."""

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pycolmap
 
-from smust3r_colmap.products import FloatArray
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.refinement.bundle_adjustment import Priors, adjust, robust_cost
 from smust3r_colmap.refinement.subset_adjustment import part_of
 

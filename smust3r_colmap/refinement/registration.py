@@ -18,7 +18,6 @@ import numpy as np
 import pycolmap
 
 from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks
-from smust3r_colmap.refinement.bundle_adjustment import ENOUGH_OBSERVATIONS, ModelFigures, figures_of, weak_images
 from smust3r_colmap.refinement.acceptance import (
     MAX_LOST,
     StepReport,
@@ -27,6 +26,7 @@ from smust3r_colmap.refinement.acceptance import (
     report_of,
     take_snapshot,
 )
+from smust3r_colmap.refinement.bundle_adjustment import ENOUGH_OBSERVATIONS, ModelFigures, figures_of, weak_images
 
 Agrees = Callable[[pycolmap.Reconstruction, int], bool]
 

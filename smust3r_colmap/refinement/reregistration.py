@@ -17,16 +17,12 @@ from pathlib import Path
 
 import pycolmap
 
-from smust3r_colmap.errors import DegenerateAlignmentError
-from smust3r_colmap.evaluation.trajectory import compare_trajectories, read_reference_sparse
-from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks
 from smust3r_colmap.colmap.database import write_colmap_database
-from smust3r_colmap.geometry.sim3 import invert_rigid
-from smust3r_colmap.products import FloatArray
-from smust3r_colmap.refinement.bundle_adjustment import ModelFigures, Tolerance, figures_of, triangulate
-from smust3r_colmap.refinement.mapper import TIGHT_PART, Bench, cameras_of, poses_of
-from smust3r_colmap.refinement.misregistration import SOUND_SHARE, Agreement, bent_images
-from smust3r_colmap.features.correspondences import Pair
+from smust3r_colmap.colmap.reconstruction import cameras_of, poses_of
+from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.evaluation.readers import read_reference_sparse
+from smust3r_colmap.evaluation.trajectory import compare_trajectories
+from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks
 from smust3r_colmap.features.guided_verification import (
     MIN_CONSENT,
     MIN_MATCHES,
@@ -35,7 +31,12 @@ from smust3r_colmap.features.guided_verification import (
     ask_consent,
     consent_shares,
 )
+from smust3r_colmap.geometry.arrays import FloatArray, Pair
+from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.refinement.acceptance import StepReport, movement, report_of
+from smust3r_colmap.refinement.bundle_adjustment import ModelFigures, Tolerance, figures_of, triangulate
+from smust3r_colmap.refinement.mapper import TIGHT_PART, Bench
+from smust3r_colmap.refinement.misregistration import SOUND_SHARE, Agreement, bent_images
 
 logger = logging.getLogger(__name__)
 

@@ -17,29 +17,30 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from smust3r_colmap.features.sift import match_pairs, open_database
-from smust3r_colmap.features.stage import features_of_run
+from smust3r_colmap.colmap.database import open_database
 from smust3r_colmap.config import RunConfig
 from smust3r_colmap.errors import ConfigError
+from smust3r_colmap.execution.stage_clock import StageClock
 from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks, usable_cores
+from smust3r_colmap.features.covisibility import SeenSurface, sample_rows, select_pairs
+from smust3r_colmap.features.matching import match_pairs
+from smust3r_colmap.features.stage import features_of_run
+from smust3r_colmap.geometry.arrays import FloatArray, Pair
 from smust3r_colmap.geometry.camera import Intrinsics, pointmap_from_depth
 from smust3r_colmap.geometry.sim3 import invert_rigid
-from smust3r_colmap.products import EMPTY_CLOUD, DepthMaps, FloatArray, ImageCollection, RunFeatures, Scene
-from smust3r_colmap.refinement.bundle_adjustment import ModelFigures
-from smust3r_colmap.refinement.mapper import LOOSE_PART
-from smust3r_colmap.features.correspondences import Pair
-from smust3r_colmap.features.covisibility import SeenSurface, sample_rows, select_pairs
+from smust3r_colmap.products import EMPTY_CLOUD, DepthMaps, ImageCollection, RunFeatures, Scene
 from smust3r_colmap.refinement.acceptance import StepReport
-from smust3r_colmap.refinement.global_refinement import (
+from smust3r_colmap.refinement.bundle_adjustment import ModelFigures
+from smust3r_colmap.refinement.global_refinement import STAYED, RefinedFigures, RefineTask, refine_scenes
+from smust3r_colmap.refinement.mapper import LOOSE_PART
+from smust3r_colmap.storage.run_directory import (
     DATABASE_FILE,
     MODEL_FOLDER,
-    STAYED,
-    RefinedFigures,
-    RefineTask,
-    refine_scenes,
+    RunDirectory,
+    key_of,
+    read_json,
+    write_json,
 )
-from smust3r_colmap.storage.run_directory import RunDirectory, key_of, read_json, write_json
-from smust3r_colmap.execution.stage_clock import StageClock
 
 CLOUD_POINTS_PER_IMAGE = 500
 """Of a cloud without tracks, how many points say what an image sees."""

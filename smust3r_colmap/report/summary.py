@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from smust3r_colmap.execution.progress import format_seconds
+from smust3r_colmap.execution.stage_clock import StageSummary
+from smust3r_colmap.products import MissingOutput
 
 EXIT_GOOD = 0
 EXIT_WEAK = 3
@@ -45,23 +47,6 @@ class ImageRemark:
 
     name: str
     reason: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class StageSummary:
-    """What a stage cost.
-
-    Args:
-        name: as in the progress report.
-        wall_s: time that went by.
-        cpu_s: processor time, child processes included.
-        reused: everything was found finished by an earlier run.
-    """
-
-    name: str
-    wall_s: float
-    cpu_s: float
-    reused: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -226,14 +211,6 @@ class RefinementSummary:
     principal_point: str
     doubts: tuple[str, ...]
     steps: tuple[RefinementStep, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class MissingOutput:
-    """A part of the result that could not be written, and why."""
-
-    name: str
-    reason: str
 
 
 @dataclass(frozen=True, kw_only=True)

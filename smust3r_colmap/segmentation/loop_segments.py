@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from smust3r_colmap.products import Segment
 from smust3r_colmap.segmentation.similarity import (
     AlikeSegments,
     Descriptors,
@@ -37,7 +38,6 @@ from smust3r_colmap.segmentation.similarity import (
     similarity_statistics,
     with_neighbours,
 )
-from smust3r_colmap.products import Segment
 
 # The thresholds: see the module docstring.
 _STRONG_SIGMAS = 4.0

@@ -37,8 +37,8 @@ import numpy as np
 import numpy.typing as npt
 
 from smust3r_colmap.errors import InputError
+from smust3r_colmap.geometry.arrays import IntArray
 
-IntArray = npt.NDArray[np.int64]
 Descriptors = npt.NDArray[np.float32]
 
 # Far enough for the view to have changed on a walk; a third where the collection is small.

@@ -18,10 +18,11 @@ from operator import matmul
 
 import numpy as np
 
-from smust3r_colmap.stitching.spanning_tree import ChainedPart
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.transform import Transform
+from smust3r_colmap.products import SegmentAlignment, SegmentPiece, consecutive_runs
 from smust3r_colmap.segmentation.loop_segments import PlannedLoop
-from smust3r_colmap.products import FloatArray, SegmentAlignment, SegmentPiece, consecutive_runs
+from smust3r_colmap.stitching.spanning_tree import ChainedPart
 
 MIN_END_IMAGES = 3
 """Images of each end that the loop piece must hold and share with a window."""

@@ -14,11 +14,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
 from smust3r_colmap.geometry.so3 import skew
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.products import DenseMaps, FloatArray, SegmentPiece
+from smust3r_colmap.products import DenseMaps, SegmentPiece
 
 logger = logging.getLogger(__name__)
 

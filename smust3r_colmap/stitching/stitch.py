@@ -13,15 +13,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from smust3r_colmap.stitching.spanning_tree import ChainedPart, chain_pieces
 from smust3r_colmap.config import LoopKernel
 from smust3r_colmap.geometry.so3 import angles_between
 from smust3r_colmap.geometry.transform import Transform
+from smust3r_colmap.products import SegmentAlignment, SegmentPiece
 from smust3r_colmap.segmentation.loop_segments import PlannedLoop
 from smust3r_colmap.stitching.loop_verification import LoopVerdict, verify_loops
 from smust3r_colmap.stitching.pose_graph.graph import TRUSTED, PoseGraph
 from smust3r_colmap.stitching.pose_graph.optimise import GraphSolution, optimise
-from smust3r_colmap.products import SegmentAlignment, SegmentPiece
+from smust3r_colmap.stitching.spanning_tree import ChainedPart, chain_pieces
 
 
 @dataclass(frozen=True, kw_only=True)

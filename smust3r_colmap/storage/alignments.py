@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from smust3r_colmap.alignment.pairwise import Edges, TriedAlignment
 from smust3r_colmap.geometry.groups import GROUPS
-from smust3r_colmap.products import SegmentAlignment, TransformEstimate
+from smust3r_colmap.products import Edges, SegmentAlignment, TransformEstimate, TriedAlignment
 from smust3r_colmap.storage.run_directory import read_json, write_json
 
 _FILE = "edges.json"

@@ -50,6 +50,8 @@ from filelock import FileLock, Timeout
 
 from smust3r_colmap.errors import RunDirectoryError, RunLockedError, StorageError
 
+MODEL_FOLDER, DATABASE_FILE = "model", "database.db"
+
 FORMAT_VERSION = 1
 """Part of every key; a change of what a stage stores or computes raises it."""
 

@@ -20,6 +20,18 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.backbones.base import BackboneResult
+from smust3r_colmap.errors import CollectionError, DegenerateAlignmentError
+from smust3r_colmap.geometry.arrays import Float32Array, FloatArray
+from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres, pointmap_from_depth
+from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.products import (
+    ImageCollection,
+    Segment,
+    SegmentPiece,
+    SegmentReconstruction,
+    UnregisteredImage,
+)
+from smust3r_colmap.storage.run_directory import key_of
 from smust3r_colmap.synthetic.descriptors import (
     NO_OVERLAP,
     FalseLoop,
@@ -45,20 +57,6 @@ from smust3r_colmap.synthetic.distortion import (
 )
 from smust3r_colmap.synthetic.settings import OracleSettings
 from smust3r_colmap.synthetic.truth import TrueScene
-from smust3r_colmap.errors import CollectionError, DegenerateAlignmentError
-from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres, pointmap_from_depth
-from smust3r_colmap.geometry.sim3 import invert_rigid
-from smust3r_colmap.products import (
-    ImageCollection,
-    Segment,
-    SegmentPiece,
-    SegmentReconstruction,
-    UnregisteredImage,
-)
-from smust3r_colmap.storage.run_directory import key_of
-
-FloatArray = npt.NDArray[np.float64]
-Float32Array = npt.NDArray[np.float32]
 
 _FALSE_LOOPS, _DESCRIPTORS, _CHAIN, _SEGMENT, _IMAGE = range(5)
 """Streams of random numbers of one seed, so that no setting changes what another one draws."""

@@ -15,12 +15,11 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from smust3r_colmap.errors import ConfigError
+from smust3r_colmap.geometry.arrays import FloatArray
+from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.synthetic.settings import OracleSettings
 from smust3r_colmap.synthetic.truth import TrueScene
-from smust3r_colmap.errors import ConfigError
-from smust3r_colmap.geometry.sim3 import invert_rigid
-
-FloatArray = npt.NDArray[np.float64]
 
 POINTS_PER_IMAGE = (6, 8)
 """Rows and columns of the points by which overlap is measured; 48 of them tell it to some percent."""

@@ -12,11 +12,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from smust3r_colmap.synthetic.settings import REFERENCE_LENGTH, OracleSettings, WarpGroup
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.geometry.so3 import nearest_rotation
-
-FloatArray = npt.NDArray[np.float64]
+from smust3r_colmap.synthetic.settings import REFERENCE_LENGTH, OracleSettings, WarpGroup
 
 FIELD_DEGREE = 3
 """Largest total degree of the polynomials of the smooth depth error: two humps across the image."""

@@ -23,11 +23,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.errors import ConfigError, StorageError
+from smust3r_colmap.geometry.arrays import Float32Array, FloatArray, UInt8Array
 from smust3r_colmap.geometry.camera import Intrinsics
 
-FloatArray = npt.NDArray[np.float64]
-Float32Array = npt.NDArray[np.float32]
-ByteArray = npt.NDArray[np.uint8]
 IntArray = npt.NDArray[np.intp]
 
 # Corners (lower, upper) in metres. The first box is the room, seen from inside; furniture keeps
@@ -112,7 +110,7 @@ class DemoScene:
     def __post_init__(self) -> None:
         object.__setattr__(self, "_atlas", _paint_atlas(np.random.default_rng((self.seed, 0))))
 
-    def render(self, world_from_cam: npt.ArrayLike, intrinsics: Intrinsics) -> tuple[ByteArray, Float32Array]:
+    def render(self, world_from_cam: npt.ArrayLike, intrinsics: Intrinsics) -> tuple[UInt8Array, Float32Array]:
         """One photograph and its depth.
 
         Args:
@@ -131,7 +129,7 @@ class DemoScene:
         strips = [self._render_strip(pose, strip) for strip in _strips(intrinsics)]
         return np.concatenate([rgb for rgb, _ in strips]), np.concatenate([depth for _, depth in strips])
 
-    def _render_strip(self, world_from_cam: FloatArray, intrinsics: Intrinsics) -> tuple[ByteArray, Float32Array]:
+    def _render_strip(self, world_from_cam: FloatArray, intrinsics: Intrinsics) -> tuple[UInt8Array, Float32Array]:
         fine = intrinsics.resized(intrinsics.width * _SUPERSAMPLING, intrinsics.height * _SUPERSAMPLING)
         rgb = self._atlas.colours(_trace(world_from_cam, fine), pixels_per_unit=fine.focal_px)
         small = cv2.resize(rgb, (intrinsics.width, intrinsics.height), interpolation=cv2.INTER_AREA)
@@ -346,13 +344,13 @@ class _Atlas:
         origin_xy: (faces, 2) level-0 texel at the world's zero.
     """
 
-    rgb: ByteArray
+    rgb: UInt8Array
     level_xy: IntArray
     uv_axes: IntArray
     texels_per_m: Float32Array
     origin_xy: Float32Array
 
-    def colours(self, hits: _Hits, *, pixels_per_unit: float) -> ByteArray:
+    def colours(self, hits: _Hits, *, pixels_per_unit: float) -> UInt8Array:
         """(H, W, 3) colours, trilinear between the two levels nearest to the size of a pixel.
 
         A pixel covers depth^2 / (focal^2 * slope) of the surface: the area of its ray's cross
@@ -364,7 +362,7 @@ class _Atlas:
         xy = [self._texels(hits, column) for column in (0, 1)]
         fraction = (level - finer).astype(np.float32)[:, :, None]
         mixed = self._sample(xy, finer) * (1 - fraction) + self._sample(xy, finer + 1) * fraction
-        rounded: ByteArray = (mixed + 0.5).astype(np.uint8)
+        rounded: UInt8Array = (mixed + 0.5).astype(np.uint8)
         return rounded
 
     def _texels(self, hits: _Hits, column: int) -> Float32Array:
@@ -423,7 +421,7 @@ def _shelves(size_xy: IntArray) -> tuple[IntArray, int]:
     return corner_xy, y + shelf
 
 
-def _with_coarser_levels(level0: ByteArray) -> tuple[ByteArray, IntArray]:
+def _with_coarser_levels(level0: UInt8Array) -> tuple[UInt8Array, IntArray]:
     """The atlas with its coarser copies, and where each level begins."""
     height = len(level0)
     rgb = np.zeros((height, _ATLAS_WIDTH * 3 // 2, 3), dtype=np.uint8)
@@ -438,7 +436,7 @@ def _with_coarser_levels(level0: ByteArray) -> tuple[ByteArray, IntArray]:
     return rgb, level_xy
 
 
-def _paint_face(rng: np.random.Generator, face: int, rows: int, columns: int) -> ByteArray:
+def _paint_face(rng: np.random.Generator, face: int, rows: int, columns: int) -> UInt8Array:
     """(rows, columns, 3) of one face: pattern, then grain of all sizes, then things stuck on it."""
     picture = np.empty((rows, columns, 3), dtype=np.float32)
     picture[:] = rng.uniform(95, 185, 3)
@@ -452,7 +450,7 @@ def _paint_face(rng: np.random.Generator, face: int, rows: int, columns: int) ->
         _stick_poster(rng, picture)
     for _ in range(round(rows * columns * _TEXEL_M**2 * 8)):
         _write_words(rng, picture)
-    finished: ByteArray = np.clip(picture, 0, 255).astype(np.uint8)
+    finished: UInt8Array = np.clip(picture, 0, 255).astype(np.uint8)
     return finished
 
 

@@ -8,7 +8,8 @@ from pathlib import PurePosixPath
 import numpy as np
 from scipy.spatial import cKDTree
 
-from smust3r_colmap.validation.description import DenseFolder, FloatArray, Subject
+from smust3r_colmap.geometry.arrays import FloatArray
+from smust3r_colmap.validation.description import DenseFolder, Subject
 from smust3r_colmap.validation.rules import Evidence, Severity, measured, offenders, rule
 
 _PLY_COLUMNS = ("nx", "ny", "nz", "red", "green", "blue")

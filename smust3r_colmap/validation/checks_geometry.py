@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from smust3r_colmap.validation.description import BoolArray, FloatArray, Frame, IntArray, Subject
+from smust3r_colmap.geometry.arrays import BoolArray, FloatArray, IntArray
+from smust3r_colmap.validation.description import Frame, Subject
 from smust3r_colmap.validation.rules import Evidence, Severity, measured, offenders, rule
 
 _HIGH_ERROR_PX = 2.0

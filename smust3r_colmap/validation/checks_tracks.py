@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from smust3r_colmap.validation.description import NO_POINT, BoolArray, IntArray, Points, Subject
+from smust3r_colmap.geometry.arrays import BoolArray, IntArray
+from smust3r_colmap.validation.description import NO_POINT, Points, Subject
 from smust3r_colmap.validation.projection import index_of
 from smust3r_colmap.validation.rules import Evidence, Severity, measured, offenders, rule
 

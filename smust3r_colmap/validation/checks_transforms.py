@@ -9,7 +9,8 @@ import numpy as np
 
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.evaluation.trajectory import Evaluation, compare_trajectories
-from smust3r_colmap.validation.description import FloatArray, Images, Subject, TransformsFile, TransformsFrame
+from smust3r_colmap.geometry.arrays import FloatArray
+from smust3r_colmap.validation.description import Images, Subject, TransformsFile, TransformsFrame
 from smust3r_colmap.validation.rules import Evidence, Severity, measured, offenders, rule
 from smust3r_colmap.validation.transforms_file import INTRINSICS
 

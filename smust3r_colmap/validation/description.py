@@ -17,9 +17,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
+from smust3r_colmap.geometry.arrays import BoolArray, FloatArray, IntArray
 
 NO_POINT = -1
 """Point id of an observation that belongs to no point; COLMAP's largest unsigned number."""

@@ -13,15 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from smust3r_colmap.validation.description import (
-    CAMERA_MODELS,
-    Camera,
-    FloatArray,
-    IntArray,
-    ModelDescription,
-    Points,
-    Projection,
-)
+from smust3r_colmap.geometry.arrays import FloatArray, IntArray
+from smust3r_colmap.validation.description import CAMERA_MODELS, Camera, ModelDescription, Points, Projection
 
 _SAMPLED_POINTS = 2000
 """Of all points, evenly over the file, to see whether an image looks at the scene at all."""

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, UnidentifiedImageError
 
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.importers.images import SUFFIXES
 from smust3r_colmap.validation.description import (
     Database,
@@ -22,7 +23,6 @@ from smust3r_colmap.validation.description import (
     DenseFolder,
     DepthFolder,
     FileFolder,
-    FloatArray,
     ImageFile,
     PlyCloud,
 )

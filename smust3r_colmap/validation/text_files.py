@@ -16,19 +16,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from smust3r_colmap.validation.description import (
-    CAMERA_MODELS,
-    NO_POINT,
-    BoolArray,
-    Camera,
-    Defect,
-    FloatArray,
-    Frame,
-    Images,
-    IntArray,
-    Points,
-    Rig,
-)
+from smust3r_colmap.geometry.arrays import BoolArray, FloatArray, IntArray
+from smust3r_colmap.validation.description import CAMERA_MODELS, NO_POINT, Camera, Defect, Frame, Images, Points, Rig
 
 RecordT = TypeVar("RecordT")
 

@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from smust3r_colmap.validation.description import FloatArray, ImageFile, TransformsFile, TransformsFrame
+from smust3r_colmap.geometry.arrays import FloatArray
+from smust3r_colmap.validation.description import ImageFile, TransformsFile, TransformsFrame
 from smust3r_colmap.validation.surroundings import read_image_file
 
 INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy")

@@ -23,18 +23,16 @@ from smust3r_colmap.backbones.classical.calibration import (
     misfits,
 )
 from smust3r_colmap.backbones.classical.dense import DepthTask, make_depth
-from smust3r_colmap.features.sift import (
-    Pair,
-    match_pairs,
-    open_database,
-    plan_loop_pairs,
-    plan_pairs,
-)
 from smust3r_colmap.backbones.classical.mapping import METHOD_VERSION, MappedSegment, MappingTask, map_segment
-from smust3r_colmap.features.stage import describe_images, features_of_run
 from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
+from smust3r_colmap.colmap.database import open_database
 from smust3r_colmap.config import ClassicalConfig
+from smust3r_colmap.execution.progress import Reporter, Stage
 from smust3r_colmap.execution.task_pool import TaskFailure, TaskPool
+from smust3r_colmap.features.matching import match_pairs
+from smust3r_colmap.features.pairs import plan_loop_pairs, plan_pairs
+from smust3r_colmap.features.stage import describe_images, features_of_run
+from smust3r_colmap.geometry.arrays import Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import (
     DenseMaps,
@@ -47,9 +45,8 @@ from smust3r_colmap.products import (
     SegmentReconstruction,
     UnregisteredImage,
 )
-from smust3r_colmap.execution.progress import Reporter, Stage
-from smust3r_colmap.storage.run_directory import RunDirectory, StageFolder, key_of
 from smust3r_colmap.storage.dense_maps import EmptyMaps, StoredMaps
+from smust3r_colmap.storage.run_directory import RunDirectory, StageFolder, key_of
 
 logger = logging.getLogger(__name__)
 

@@ -21,14 +21,14 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from smust3r_colmap.features.sift import internal_name, open_database
 from smust3r_colmap.backbones.classical.mapped_model import MappedModel, model_from_reconstruction, placed_images
 from smust3r_colmap.backbones.classical.mapping import ENOUGH_REGISTERED, MappedSegment, MappingTask, map_segment
 from smust3r_colmap.backbones.classical.model_checks import FOCAL_TOLERANCE, diverged_focal
+from smust3r_colmap.colmap.database import internal_name, open_database
+from smust3r_colmap.estimators.weighted_median import weighted_median
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import UnregisteredImage
-from smust3r_colmap.estimators.weighted_median import weighted_median
 
 logger = logging.getLogger(__name__)
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from smust3r_colmap.backbones.classical.plane_sweep import ColourImage, reconstruct_depth
 from smust3r_colmap.importers.images import load_rgb
 from smust3r_colmap.products import SegmentPiece, SourceImage
-from smust3r_colmap.storage.run_directory import StageFolder
 from smust3r_colmap.storage.dense_maps import ImageMaps, write_maps
+from smust3r_colmap.storage.run_directory import StageFolder
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

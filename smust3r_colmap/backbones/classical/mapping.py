@@ -19,7 +19,6 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from smust3r_colmap.features.sift import Pair, open_database, write_images
 from smust3r_colmap.backbones.classical.mapped_model import (
     MappedModel,
     connected_groups,
@@ -37,6 +36,8 @@ from smust3r_colmap.backbones.classical.model_checks import (
 )
 from smust3r_colmap.backbones.classical.start_pair import ENOUGH_ANGLE_DEG, MIN_INLIERS, StartPair, choose_start_pairs
 from smust3r_colmap.backbones.classical.thinning import thin_matches
+from smust3r_colmap.colmap.database import open_database, write_images
+from smust3r_colmap.geometry.arrays import Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import UnregisteredImage
 

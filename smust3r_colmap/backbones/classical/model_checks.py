@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from smust3r_colmap.features.sift import Pair
 from smust3r_colmap.backbones.classical.mapped_model import MappedModel
+from smust3r_colmap.geometry.arrays import Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 

@@ -33,12 +33,12 @@ from smust3r_colmap.backbones.classical.view_selection import (
     inverse_depth_range,
 )
 from smust3r_colmap.errors import ImageError
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.products import Tracks
 
 logger = logging.getLogger(__name__)
 
-FloatArray = npt.NDArray[np.float64]
 FloatMap = npt.NDArray[np.float32]
 ColourImage = npt.NDArray[np.uint8]
 CostVolume = npt.NDArray[np.int16]

@@ -14,14 +14,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
-from smust3r_colmap.features.sift import Pair
+from smust3r_colmap.geometry.arrays import FloatArray, Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.so3 import nearest_rotation
-
-FloatArray = npt.NDArray[np.float64]
 
 MIN_INLIERS = 50
 """Verified matches of a pair to start from; COLMAP's own 100, halved once as it does where none has them."""

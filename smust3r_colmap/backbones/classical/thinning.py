@@ -13,7 +13,7 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.features.sift import Pair
+from smust3r_colmap.geometry.arrays import Pair
 
 Matches = npt.NDArray[np.uint32]
 

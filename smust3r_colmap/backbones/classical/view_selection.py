@@ -11,10 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from smust3r_colmap.geometry.arrays import FloatArray
 
 BEST_PARALLAX_DEG = 4.0
 """Smaller is imprecise, larger is occluded and slanted. Measured on an indoor sequence: 3 to 5 degrees

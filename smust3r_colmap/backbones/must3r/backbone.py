@@ -72,13 +72,13 @@ from smust3r_colmap.backbones.must3r.preprocessing import (
 )
 from smust3r_colmap.backbones.must3r.retrieval import RetrievalHead, mean_descriptor
 from smust3r_colmap.backbones.must3r.token_cache import TokenCache
+from smust3r_colmap.backbones.weights.cache import find_weights, named_file
 from smust3r_colmap.config import Must3rConfig
+from smust3r_colmap.execution.progress import Reporter, Stage
 from smust3r_colmap.importers.images import load_rgb
 from smust3r_colmap.products import ImageCollection, Segment, UnregisteredImage
-from smust3r_colmap.execution.progress import Reporter, Stage
-from smust3r_colmap.storage.run_directory import key_of
 from smust3r_colmap.storage.dense_maps import ImageMaps
-from smust3r_colmap.backbones.weights.cache import find_weights, named_file
+from smust3r_colmap.storage.run_directory import key_of
 
 GIB = 2**30
 MIN_CONFIDENCE = 1.5

@@ -23,21 +23,20 @@ import numpy.typing as npt
 import pycolmap
 from torch import Tensor
 
-from smust3r_colmap.estimators.sim3 import MAD_TO_SIGMA, consensus_sim3, evenly_chosen
 from smust3r_colmap.backbones.must3r.head import Pointmaps
 from smust3r_colmap.backbones.must3r.pose_refinement import refine_pose
 from smust3r_colmap.backbones.must3r.preprocessing import NetworkWindow
 from smust3r_colmap.config import CameraFit
 from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.estimators.robust import MAD_TO_SIGMA, evenly_chosen
+from smust3r_colmap.estimators.sim3 import consensus_sim3
+from smust3r_colmap.estimators.weighted_median import weighted_median
+from smust3r_colmap.geometry.arrays import BoolArray, FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.geometry.so3 import nearest_rotation
 from smust3r_colmap.importers.camera_prior import PLAUSIBLE_FOCAL_RATIO
-from smust3r_colmap.estimators.weighted_median import weighted_median
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 WEISZFELD_ITERATIONS = 10
 """As published."""

@@ -13,11 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from smust3r_colmap.backbones.must3r.preprocessing import NetworkWindow
-
-FloatArray = npt.NDArray[np.float64]
-Float32Array = npt.NDArray[np.float32]
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.int64]
+from smust3r_colmap.geometry.arrays import Float32Array, FloatArray, IntArray
 
 SAME_SURFACE = 1.03
 """Largest ratio of depths among four neighbours of one surface: one at 85 degrees to the line of sight changes by 2 %

@@ -11,14 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from smust3r_colmap.estimators.sim3 import CAUCHY_TUNING, MAD_TO_SIGMA, TRIMMING_ROUNDS
 from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.estimators.robust import CAUCHY_TUNING, MAD_TO_SIGMA, TRIMMING_ROUNDS
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.so3 import skew
-
-FloatArray = npt.NDArray[np.float64]
 
 MAX_ITERATIONS = 30
 """Of each of the two rounds; 5 to 15 are usual."""

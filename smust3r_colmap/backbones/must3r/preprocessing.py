@@ -14,15 +14,13 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from PIL import Image
 from torch import Tensor
 
 from smust3r_colmap.errors import ImageError
+from smust3r_colmap.geometry.arrays import FloatArray, UInt8Array
 
-UInt8Array = npt.NDArray[np.uint8]
-FloatArray = npt.NDArray[np.float64]
 Resolution = tuple[int, int]
 """Longer and shorter side of a shape, in pixels."""
 

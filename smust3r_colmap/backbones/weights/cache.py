@@ -10,8 +10,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from smust3r_colmap.errors import CheckpointError
 from smust3r_colmap.backbones.weights.catalogue import CATALOGUE, Kind, OfficialFile, find_official
+from smust3r_colmap.errors import CheckpointError
 
 CACHE_VARIABLE = "SMUST3R_CACHE"
 WEIGHTS_VARIABLE = "SMUST3R_WEIGHTS"

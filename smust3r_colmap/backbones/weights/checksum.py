@@ -6,8 +6,8 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from smust3r_colmap.errors import CheckpointError
 from smust3r_colmap.backbones.weights.catalogue import find_official, official_with_sum
+from smust3r_colmap.errors import CheckpointError
 
 _BLOCK_BYTES = 2**20
 

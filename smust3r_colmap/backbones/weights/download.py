@@ -28,10 +28,10 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from smust3r_colmap import __version__
-from smust3r_colmap.errors import DownloadError
-from smust3r_colmap.execution.progress import Reporter
 from smust3r_colmap.backbones.weights.cache import CACHE_VARIABLE, part_of
 from smust3r_colmap.backbones.weights.checksum import md5_of
+from smust3r_colmap.errors import DownloadError
+from smust3r_colmap.execution.progress import Reporter
 
 _MIB = 2**20
 

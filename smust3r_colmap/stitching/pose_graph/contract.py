@@ -14,8 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from smust3r_colmap.geometry.arrays import BoolArray, FloatArray, IntArray
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.stitching.pose_graph.graph import TRUSTED, BoolArray, FloatArray, IntArray, PoseGraph
+from smust3r_colmap.stitching.pose_graph.graph import TRUSTED, PoseGraph
 from smust3r_colmap.stitching.pose_graph.linearise import edge_errors, inverse_right_jacobian
 
 SINGULAR_RIDGE = 1e-12

@@ -14,11 +14,8 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.geometry.transform import Transform
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 TRUSTED = -1
 """Loop number of the edges of the sequence, which no kernel touches."""

@@ -13,9 +13,16 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csc_array
 
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.stitching.pose_graph.graph import FloatArray, PoseGraph, edge_weights, loop_sums
-from smust3r_colmap.stitching.pose_graph.linearise import EdgeErrors, NormalEquations, edge_errors, linearise, squared_distances
+from smust3r_colmap.stitching.pose_graph.graph import PoseGraph, edge_weights, loop_sums
+from smust3r_colmap.stitching.pose_graph.linearise import (
+    EdgeErrors,
+    NormalEquations,
+    edge_errors,
+    linearise,
+    squared_distances,
+)
 
 logger = logging.getLogger(__name__)
 

@@ -18,8 +18,9 @@ import numpy.typing as npt
 from scipy.sparse import bsr_array, coo_array, csc_array, csr_array, eye_array
 from scipy.sparse.linalg import SuperLU, splu
 
+from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.stitching.pose_graph.graph import FloatArray, IntArray, PoseGraph
+from smust3r_colmap.stitching.pose_graph.graph import PoseGraph
 
 UNMEASURED = 1e-12
 """Curvature, over the largest, of a direction that no edge measures; damping needs some to hold on to."""

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.stitching.pose_graph.graph import FloatArray, PoseGraph
+from smust3r_colmap.stitching.pose_graph.graph import PoseGraph
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -16,9 +16,10 @@ from typing import Literal
 import numpy as np
 from scipy.special import chdtri
 
+from smust3r_colmap.geometry.arrays import BoolArray, FloatArray, IntArray
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.stitching.pose_graph.contract import contract
-from smust3r_colmap.stitching.pose_graph.graph import TRUSTED, BoolArray, FloatArray, IntArray, PoseGraph, loop_sums
+from smust3r_colmap.stitching.pose_graph.graph import TRUSTED, PoseGraph, loop_sums
 from smust3r_colmap.stitching.pose_graph.levenberg import (
     cauchy,
     levenberg_marquardt,

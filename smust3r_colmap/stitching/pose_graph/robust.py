@@ -18,8 +18,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
+from smust3r_colmap.geometry.arrays import BoolArray, FloatArray, IntArray
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.stitching.pose_graph.graph import TRUSTED, BoolArray, FloatArray, IntArray, PoseGraph, edge_weights
+from smust3r_colmap.stitching.pose_graph.graph import TRUSTED, PoseGraph, edge_weights
 from smust3r_colmap.stitching.pose_graph.levenberg import Descent, levenberg_marquardt, quadratic
 from smust3r_colmap.stitching.pose_graph.linearise import NormalEquations, edge_errors, linearise, square_roots
 

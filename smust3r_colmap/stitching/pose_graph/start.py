@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from smust3r_colmap.geometry.arrays import BoolArray, FloatArray
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.stitching.pose_graph.graph import BoolArray, FloatArray, PoseGraph
+from smust3r_colmap.stitching.pose_graph.graph import PoseGraph
 
 TRANSLATION = slice(0, 3)
 """Where the translation stands in the tangent vectors of every group."""

@@ -1,0 +1,97 @@
+"""Which images are matched with which."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+import numpy.typing as npt
+
+from smust3r_colmap.geometry.arrays import FloatArray, Pair
+from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.products import Segment, consecutive_runs
+
+MAX_TURN_DEG = 60.0
+"""Of two cameras without points between them: what one sees straight ahead is beyond the edge of the other."""
+
+
+def plan_pairs(segment: Segment, *, neighbours: int, exhaustive_below: int) -> tuple[Pair, ...]:
+    """Pairs (i < j) of a window worth matching: all in a small one, else neighbours and doubling steps.
+
+    Only inside the segment: a longer reach finds look-alike places and folds the model.
+    """
+    images = sorted(segment.images)
+    if len(images) <= exhaustive_below:
+        return _near_pairs(images, len(images) - 1)
+    return _near_pairs(images, neighbours)
+
+
+def plan_loop_pairs(segment: Segment, descriptors: npt.NDArray[np.float32], *, neighbours: int) -> tuple[Pair, ...]:
+    """Pairs (i < j) of a loop segment: each end like a window, and across the most alike.
+
+    Across, each image is paired with the ``neighbours`` images of the other end whose descriptors are
+    most like its own: half of all pairs, and nine tenths of the verified matches (six loops of two walks).
+
+    Args:
+        segment: of kind ``"loop"``. descriptors: (N, D) unit vectors of all images of the collection.
+    """
+    runs = consecutive_runs(segment.images)
+    pairs = [pair for run in runs for pair in _near_pairs(run, neighbours)]
+    for first, second in combinations(runs, 2):
+        similarity = descriptors[list(first)] @ descriptors[list(second)].T
+        wanted = np.zeros(similarity.shape, dtype=bool)
+        for axis in (0, 1):
+            most_alike = np.argsort(-similarity, axis=axis, kind="stable")
+            few = range(min(neighbours, similarity.shape[axis]))
+            np.put_along_axis(wanted, np.take(most_alike, few, axis=axis), values=True, axis=axis)
+        pairs += [(first[a], second[b]) for a, b in np.argwhere(wanted)]
+    return tuple(pairs)
+
+
+def _near_pairs(images: Sequence[int], neighbours: int) -> tuple[Pair, ...]:
+    """Each image with its next ``neighbours`` and with those at doubling steps."""
+    n = len(images)
+    doubling = [2**k for k in range(1, n.bit_length()) if neighbours < 2**k < n]
+    offsets = [*range(1, min(neighbours + 1, n)), *doubling]
+    return tuple((images[a], images[a + offset]) for offset in offsets for a in range(n - offset))
+
+
+def alike_pairs(
+    descriptors: npt.NDArray[np.float32], num_posed: int, *, per_image: int, exhaustive_below: int
+) -> tuple[Pair, ...]:
+    """Pairs (i < j) of each image that is to be placed with those most like it; of few images, with all.
+
+    Args:
+        descriptors: (N, D) unit vectors. num_posed: images from this one on are to be placed.
+        per_image: most similar others of each, with and without a pose.
+        exhaustive_below: up to so many images every pair is taken.
+    """
+    n = len(descriptors)
+    wanted = n - 1 if n <= exhaustive_below else min(per_image, n - 1)
+    similarity = descriptors[num_posed:] @ descriptors.T
+    similarity[np.arange(n - num_posed), np.arange(num_posed, n)] = -np.inf
+    most_alike = np.argsort(-similarity, axis=1, kind="stable")[:, :wanted]
+    return tuple(sorted({(min(i, j), max(i, j)) for i, row in enumerate(most_alike.tolist(), num_posed) for j in row}))
+
+
+def neighbouring_pairs(cam_from_world: FloatArray, *, per_image: int, exhaustive_below: int) -> tuple[Pair, ...]:
+    """Pairs (i < j) of cameras that stand near each other and look the same way; of few images, all.
+
+    Args:
+        cam_from_world: (N, 3, 4).
+        per_image: nearest others of each that differ by less than ``MAX_TURN_DEG``.
+        exhaustive_below: up to so many images every pair is taken.
+    """
+    n = len(cam_from_world)
+    if n <= exhaustive_below:
+        return tuple((i, j) for i in range(n) for j in range(i + 1, n))
+    centres, forward = invert_rigid(cam_from_world)[:, :, 3], cam_from_world[:, 2, :3]
+    pairs: set[Pair] = set()
+    for i in range(n):
+        distance = np.linalg.norm(centres - centres[i], axis=1)
+        distance[forward @ forward[i] < np.cos(np.deg2rad(MAX_TURN_DEG))] = np.inf
+        distance[i] = np.inf
+        nearest = np.argsort(distance, kind="stable")[:per_image]
+        pairs |= {(min(i, j), max(i, j)) for j in nearest[np.isfinite(distance[nearest])].tolist()}
+    return tuple(sorted(pairs))

@@ -1,0 +1,304 @@
+"""One pose and one camera for every image, from all submodels that have it."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+import numpy.typing as npt
+
+from smust3r_colmap.geometry.arrays import FloatArray, IntArray
+from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.geometry.so3 import angles_between, nearest_rotation
+from smust3r_colmap.products import DenseMaps, ImageCollection, PointCloud, Scene
+from smust3r_colmap.stitching.resection import PlacedPiece
+
+OUTLIER_RATIO = 5.0
+"""A pose is left out beyond this many times the usual disagreement of its two pieces. Drift that grows
+along an overlap reaches two to four times its own median, and is to be blended, not cut."""
+LONGEST_HOLE = 5
+"""Images missing in a row that do not end a run: a few blurred frames do not take an image's
+neighbours away, but the two sides of a loop are no neighbours."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FusedCameras:
+    """One pose per image of a connected part, with what the pieces said about each other.
+
+    Args:
+        images: (N,) indices into the collection, ascending.
+        cam_from_world: (N, 3, 4) rigid.
+        num_pieces: (N,) pieces that speak for the image: the windows that hold it, else the loop pieces.
+        num_dropped: (N,) of these, poses left out because they disagree with the rest.
+        best_piece: (N,) position of the piece, among those used, where the image lies most central.
+        position_spread: (N,) largest distance between two pieces' centres of the image, as a part of
+            ``scene_radius``; dropped poses count too; NaN where one piece holds the image.
+        rotation_spread_deg: (N,) the same for the rotations, in degrees.
+        residual_px: (N,) of the image's camera in its best piece, see ``PlacedPiece``.
+        scene_radius: median distance of the camera centres from their median, in world units.
+    """
+
+    images: tuple[int, ...]
+    cam_from_world: FloatArray
+    num_pieces: IntArray
+    num_dropped: IntArray
+    best_piece: IntArray
+    position_spread: FloatArray
+    rotation_spread_deg: FloatArray
+    residual_px: FloatArray
+    scene_radius: float
+
+    def __post_init__(self) -> None:
+        n = len(self.images)
+        counts = ("num_pieces", "num_dropped", "best_piece")
+        for name in (*counts, "position_spread", "rotation_spread_deg", "residual_px"):
+            if getattr(self, name).shape != (n,):
+                raise ValueError(f"FusedCameras: {n} images, {name} {getattr(self, name).shape}")
+        if self.cam_from_world.shape != (n, 3, 4) or not np.isfinite(self.cam_from_world).all():
+            raise ValueError(f"FusedCameras: {n} images, poses {self.cam_from_world.shape}, or one is not finite")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Sightings:
+    """What the pieces say about one image; leading axis: the pieces that hold it."""
+
+    pieces: tuple[int, ...]
+    world_from_cam: FloatArray  # (K, 3, 4)
+    weights: FloatArray  # (K,) centrality
+
+    def disagreement(self) -> tuple[FloatArray, FloatArray]:
+        """(K, K) distances of the centres and (K, K) angles in degrees between the rotations."""
+        centres, rotations = self.world_from_cam[:, :, 3], self.world_from_cam[:, :, :3]
+        distances = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+        return distances, np.rad2deg(angles_between(rotations[:, None], rotations[None]))
+
+
+def fuse_cameras(pieces: Sequence[PlacedPiece]) -> FusedCameras:
+    """One pose per image: centres by weighted mean, rotations by weighted chordal mean.
+
+    The weight is the image's ``centrality`` in each piece, so through an overlap the trajectory passes
+    steadily from one piece to the next. Poses that disagree are treated in two ways. A disagreement as
+    large as usual between these two pieces is drift: it is blended. A pose farther than
+    ``OUTLIER_RATIO`` times that from the weighted medoid of its image is an accident of one piece: it
+    is left out and counted. Of three poses the medoid is the majority, of two the more central one.
+    An accident is told from drift where two pieces share at least three images; two that disagree on
+    every image they share are blended all the same, and the spread tells.
+
+    Args:
+        pieces: of one connected part, placed in its world.
+
+    Raises:
+        ValueError: no piece.
+
+    Source: chordal mean after Hartley, Trumpf, Dai and Li, Rotation Averaging, IJCV 2013.
+    """
+    if not pieces:
+        raise ValueError("fusion: no piece, needed at least one")
+    sightings = _sightings_by_image(pieces)
+    centres = np.concatenate([sighting.world_from_cam[:, :, 3] for sighting in sightings.values()])
+    radius = float(np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
+    usual = _usual_disagreement(sightings.values(), radius)
+    kept = [_agreeing(sighting, usual) for sighting in sightings.values()]
+    spread = [[matrix.max() for matrix in sighting.disagreement()] for sighting in sightings.values()]
+    alone = np.array([len(sighting.pieces) == 1 for sighting in sightings.values()])
+    distance, angle_deg = np.array(spread).T
+    world_from_cam = np.stack(
+        [
+            _mean_pose(sighting.world_from_cam[keep], sighting.weights[keep])
+            for sighting, keep in zip(sightings.values(), kept, strict=True)
+        ]
+    )
+    best_piece = np.array(
+        [
+            sighting.pieces[int(np.argmax(np.where(keep, sighting.weights, 0)))]
+            for sighting, keep in zip(sightings.values(), kept, strict=True)
+        ]
+    )
+    return FusedCameras(
+        images=tuple(sightings),
+        cam_from_world=invert_rigid(world_from_cam),
+        num_pieces=np.array([len(keep) for keep in kept]),
+        num_dropped=np.array([np.count_nonzero(~keep) for keep in kept]),
+        best_piece=best_piece,
+        position_spread=np.where(alone, np.nan, distance / radius if radius > 0 else distance),
+        rotation_spread_deg=np.where(alone, np.nan, angle_deg),
+        residual_px=np.array(
+            [
+                pieces[best].residual_px[pieces[best].piece.images.index(image)]
+                for image, best in zip(sightings, best_piece, strict=True)
+            ]
+        ),
+        scene_radius=radius,
+    )
+
+
+def centrality(images: Sequence[int]) -> FloatArray:
+    """(N,) weight of each image of a piece, in (0, 1]: falls linearly from the middle of its run to the ends.
+
+    An image in the middle of a run has neighbours on both sides, one at its end on one side only. A
+    run ends where more than ``LONGEST_HOLE`` images are missing.
+
+    Args:
+        images: indices into the collection, ascending.
+    """
+    ends = np.flatnonzero(np.diff(images) > LONGEST_HOLE + 1) + 1
+    runs = [np.arange(len(run)) for run in np.split(np.asarray(images), ends)]
+    to_end = np.concatenate([np.minimum(run, run[::-1]) + 1 for run in runs])
+    weights: FloatArray = to_end / to_end.max()
+    return weights
+
+
+def speaking_images(pieces: Sequence[PlacedPiece]) -> list[npt.NDArray[np.bool_]]:
+    """Per piece, (N,) for which of its images it counts: all of a window's, of a loop's those no window holds."""
+    in_windows = {image for placed in pieces if not placed.is_loop for image in placed.piece.images}
+    return [
+        np.array([not (placed.is_loop and image in in_windows) for image in placed.piece.images], dtype=np.bool_)
+        for placed in pieces
+    ]
+
+
+def _sightings_by_image(pieces: Sequence[PlacedPiece]) -> dict[int, _Sightings]:
+    """Per image, ascending, what each piece that speaks for it says."""
+    found: dict[int, list[tuple[int, FloatArray, float]]] = defaultdict(list)
+    for position, (placed, speaks) in enumerate(zip(pieces, speaking_images(pieces), strict=True)):
+        weights = centrality(placed.piece.images)
+        for k in np.flatnonzero(speaks):
+            found[placed.piece.images[k]].append((position, placed.world_from_cam[k], weights[k]))
+    return {
+        image: _Sightings(
+            pieces=tuple(position for position, _, _ in found[image]),
+            world_from_cam=np.stack([pose for _, pose, _ in found[image]]),
+            weights=np.array([weight for _, _, weight in found[image]]),
+        )
+        for image in sorted(found)
+    }
+
+
+def _usual_disagreement(sightings: Iterable[_Sightings], radius: float) -> dict[tuple[int, int], tuple[float, float]]:
+    """Per pair of pieces, the median distance and angle in degrees over the images they share.
+
+    Never less than rounding: 1e-6 of the scene's radius and 1e-4 degrees.
+    """
+    found: dict[tuple[int, int], list[tuple[float, float]]] = defaultdict(list)
+    for sighting in sightings:
+        distances, angles_deg = sighting.disagreement()
+        for a, b in combinations(range(len(sighting.pieces)), 2):
+            found[sighting.pieces[a], sighting.pieces[b]].append((distances[a, b], angles_deg[a, b]))
+    usual = {}
+    for pair, values in found.items():
+        distance, angle_deg = np.median(values, axis=0)
+        usual[pair] = (max(float(distance), 1e-6 * radius), max(float(angle_deg), 1e-4))
+    return usual
+
+
+def _agreeing(sighting: _Sightings, usual: dict[tuple[int, int], tuple[float, float]]) -> npt.NDArray[np.bool_]:
+    """(K,) which poses lie near the weighted medoid, in units of the usual disagreement."""
+    distances, angles_deg = sighting.disagreement()
+    ratio = np.zeros_like(distances)
+    for a, b in combinations(range(len(sighting.pieces)), 2):
+        usual_distance, usual_angle_deg = usual[sighting.pieces[a], sighting.pieces[b]]
+        by_distance = distances[a, b] / usual_distance if usual_distance > 0 else 0.0
+        ratio[a, b] = ratio[b, a] = max(by_distance, angles_deg[a, b] / usual_angle_deg)
+    medoid = int(np.argmin(ratio @ sighting.weights))
+    agreeing: npt.NDArray[np.bool_] = ratio[medoid] <= OUTLIER_RATIO
+    return agreeing
+
+
+def _mean_pose(world_from_cam: FloatArray, weights: FloatArray) -> FloatArray:
+    """Weighted mean (3, 4) of rigid poses (K, 3, 4)."""
+    mean = np.average(world_from_cam, axis=0, weights=weights)
+    # The rotation nearest to the mean matrix minimises the sum of squared chordal distances.
+    mean[:, :3] = nearest_rotation(mean[:, :3])
+    return mean
+
+
+def fuse_intrinsics(pieces: Sequence[PlacedPiece], camera_of_image: Sequence[int]) -> dict[int, Intrinsics]:
+    """One calibration per camera: the median of each parameter over all registered images.
+
+    A piece counts as often as it speaks for an image of the camera (``speaking_images``). Where pieces
+    disagree about the camera model, the model of most images is taken and the others have no say.
+
+    Args:
+        pieces: of one connected part, intrinsics at the original image size.
+        camera_of_image: camera of every image of the collection.
+
+    Returns:
+        By camera index, ascending; only cameras with a registered image.
+
+    Raises:
+        ValueError: two pieces hold one camera at different image sizes.
+    """
+    found: dict[int, list[Intrinsics]] = defaultdict(list)
+    for placed, speaks in zip(pieces, speaking_images(pieces), strict=True):
+        for k in np.flatnonzero(speaks):
+            found[camera_of_image[placed.piece.images[k]]].append(placed.piece.intrinsics[k])
+    return {camera: _median_intrinsics(camera, found[camera]) for camera in sorted(found)}
+
+
+def _median_intrinsics(camera: int, candidates: Sequence[Intrinsics]) -> Intrinsics:
+    """The median of those that have the most frequent model."""
+    sizes = {(candidate.width, candidate.height) for candidate in candidates}
+    if len(sizes) > 1:
+        raise ValueError(f"camera {camera}: pieces hold it at sizes {sorted(sizes)}, needed the original size only")
+    model = Counter(candidate.model for candidate in candidates).most_common(1)[0][0]
+    same = [candidate for candidate in candidates if candidate.model == model]
+    params = np.median([candidate.params for candidate in same], axis=0)
+    prior = all(candidate.has_prior_focal for candidate in same)
+    return replace(same[0], params=tuple(params), has_prior_focal=prior)
+
+
+def depth_in_cameras(
+    pieces: Sequence[PlacedPiece], dense: Sequence[DenseMaps], cameras: FusedCameras
+) -> Iterator[tuple[int, npt.NDArray[np.float32], npt.NDArray[np.float32]]]:
+    """Per image its index, its depth (H, W) in world units, 0 where there is none, and its confidence (H, W).
+
+    Each image gives its map once, from ``cameras.best_piece``; arguments as for ``fuse_points``.
+    """
+    for image, best in zip(cameras.images, cameras.best_piece, strict=True):
+        k = pieces[best].piece.images.index(image)
+        depth = points_in_camera(pieces[best], dense[best], k)[..., 2]
+        yield image, np.where(np.nan_to_num(depth) > 0, depth, 0).astype(np.float32), dense[best].confidence(k)
+
+
+def points_in_camera(placed: PlacedPiece, maps: DenseMaps, k: int) -> FloatArray:
+    """(H, W, 3) of image ``k`` of a piece, moved from the segment through the world into its camera there."""
+    pointmap_seg = maps.pointmap_seg(k)
+    cam_from_world = invert_rigid(placed.world_from_cam[k])
+    with np.errstate(invalid="ignore", divide="ignore"):  # a projective transform has a plane at infinity
+        points_world = placed.world_from_seg.apply(pointmap_seg.reshape(-1, 3))
+        points_cam: FloatArray = points_world @ cam_from_world[:, :3].T + cam_from_world[:, 3]
+    return points_cam.reshape(pointmap_seg.shape)
+
+
+def build_scene(
+    collection: ImageCollection,
+    pieces: Sequence[PlacedPiece],
+    cameras: FusedCameras,
+    intrinsics: dict[int, Intrinsics],
+    points: PointCloud,
+    *,
+    metric: bool,
+) -> Scene:
+    """Put the fused parts together under the names of the collection.
+
+    Args:
+        collection: all images of the run.
+        pieces: of this connected part; the first is the world frame. Pieces of loops are named too.
+        cameras, intrinsics, points: what the three fusions made of them.
+        metric: lengths are metres.
+    """
+    images = [collection.images[image] for image in cameras.images]
+    return Scene(
+        image_indices=cameras.images,
+        image_names=tuple(image.name for image in images),
+        camera_indices=tuple(image.camera for image in images),
+        cameras=intrinsics,
+        cam_from_world=cameras.cam_from_world,
+        points=points,
+        metric=metric,
+        segments=tuple(placed.piece.name for placed in pieces),
+    )

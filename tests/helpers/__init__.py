@@ -1,0 +1,1 @@
+"""What several test files share: scenes, finished runs, an independent reader of COLMAP files."""
