@@ -64,6 +64,6 @@ def _refuse_foreign_content(folder: Path, may_hold: Collection[str]) -> None:
     """The old folder goes away as a whole, so it must hold nothing but an older result."""
     if folder.exists() and not folder.is_dir():
         raise RunDirectoryError(f"{folder} is a file, a folder is needed; move it away")
-    foreign = sorted({entry.name for entry in folder.iterdir()} - set(may_hold)) if folder.exists() else []
-    if foreign:
-        raise RunDirectoryError(f"{folder} holds {foreign[0]!r}, which is not ours to replace; move it away")
+    external = sorted({entry.name for entry in folder.iterdir()} - set(may_hold)) if folder.exists() else []
+    if external:
+        raise RunDirectoryError(f"{folder} holds {external[0]!r}, which is not ours to replace; move it away")

@@ -119,7 +119,7 @@ def write_dense_workspace(
         images: folder of the original images.
         maps: depth by the names of the model's images.
         folder: written aside and renamed when complete.
-        memory_gib: maps that fusion holds in memory; larger workspaces are read piece by piece.
+        memory_gib: maps that fusion holds in memory; larger workspaces are read submodel by submodel.
         log_file: for the messages of native code.
 
     Raises:

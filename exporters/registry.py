@@ -25,7 +25,7 @@ from smust3r_colmap.exporters.mesh import MeshMethod, write_mesh
 from smust3r_colmap.exporters.ply import write_ply
 from smust3r_colmap.exporters.trainer_folder import write_trainer_folder
 from smust3r_colmap.exporters.tum_trajectory import write_tum
-from smust3r_colmap.products import MissingOutput, Outputs, Written
+from smust3r_colmap.report.summary import MissingOutput
 from smust3r_colmap.storage.finished_run import FinishedRun
 from smust3r_colmap.storage.run_directory import storage_errors
 
@@ -85,7 +85,7 @@ def write_where_possible(
 ) -> Outputs:
     """Write formats that take long, each a stage; one that cannot be written costs itself only."""
     missing: list[MissingOutput] = []
-    remarks: list[str] = []
+    notes: list[str] = []
     for name in names:
         with clock.stage(name, total=1) as stage:
             try:
@@ -95,8 +95,8 @@ def write_where_possible(
                 clock.warn(f"no {name}: {error}")
                 missing.append(MissingOutput(name=name, reason=str(error)))
             else:
-                remarks += [f"{name}: {remark}" for remark in written.remarks]
-    return Outputs(missing=tuple(missing), remarks=tuple(remarks))
+                notes += [f"{name}: {note}" for note in written.notes]
+    return Outputs(missing=tuple(missing), notes=tuple(notes))
 
 
 # --------------------------------------------------------------------- models and clouds
@@ -167,18 +167,18 @@ def write_trainer(finished: FinishedRun, settings: FormatSettings) -> Written:
         keep_outliers=settings.keep_outliers,
     )
     left_out = report.left_out
-    remarks = []
+    notes = []
     if left_out.far_images or left_out.far_points:
-        remarks.append(
+        notes.append(
             f"{len(left_out.far_images)} cameras and {left_out.far_points} points far from all others left out"
         )
     if left_out.unobserved_images:
-        remarks.append(f"left out, for they see no point: {_listed(left_out.unobserved_images)}")
+        notes.append(f"left out, for they see no point: {_listed(left_out.unobserved_images)}")
     if report.images_without_depth:
-        remarks.append(f"without depth: {_listed(report.images_without_depth)}")
+        notes.append(f"without depth: {_listed(report.images_without_depth)}")
     if report.images_without_mask:
-        remarks.append(f"without a mask: {_listed(report.images_without_mask)}")
-    return Written(name=TRAINER_FOLDER, remarks=tuple(remarks))
+        notes.append(f"without a mask: {_listed(report.images_without_mask)}")
+    return Written(name=TRAINER_FOLDER, notes=tuple(notes))
 
 
 def write_dense(finished: FinishedRun, settings: FormatSettings) -> Written:
@@ -192,14 +192,14 @@ def write_dense(finished: FinishedRun, settings: FormatSettings) -> Written:
         finished.output / DENSE_FOLDER,
         log_file=finished.native_log,
     )
-    remarks = []
+    notes = []
     if report.without_map:
-        remarks.append(f"without depth: {_listed(report.without_map)}")
+        notes.append(f"without depth: {_listed(report.without_map)}")
     if report.borrowed_scale:
-        remarks.append(f"depth scaled as the whole model, for lack of points: {_listed(report.borrowed_scale)}")
+        notes.append(f"depth scaled as the whole model, for lack of points: {_listed(report.borrowed_scale)}")
     if not report.num_points:
-        remarks.append("the fused cloud is empty")
-    return Written(name=DENSE_FOLDER, remarks=tuple(remarks))
+        notes.append("the fused cloud is empty")
+    return Written(name=DENSE_FOLDER, notes=tuple(notes))
 
 
 def write_mesh_of_workspace(finished: FinishedRun, settings: FormatSettings) -> Written:
@@ -246,3 +246,24 @@ FORMATS: Mapping[str, Format] = {
     ),
 }
 """In the order in which they are to be written: the mesh is made of the dense workspace."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Written:
+    """What a format has written.
+
+    Args:
+        name: the file or folder, below the output folder.
+        notes: what the user should know of it, such as what was left out.
+    """
+
+    name: str
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outputs:
+    """What came of several formats: which could not be written, and the notes of the others."""
+
+    missing: tuple[MissingOutput, ...]
+    notes: tuple[str, ...]

@@ -53,7 +53,7 @@ class SurfacePoints:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ForeignModel:
+class ExternalModel:
     """A model from anybody, checked and repaired.
 
     Args:
@@ -79,15 +79,15 @@ class ForeignModel:
     def __post_init__(self) -> None:
         n = len(self.names)
         if len(set(self.names)) != n or len(self.camera_ids) != n or self.cam_from_world.shape != (n, 3, 4):
-            raise ValueError(f"ForeignModel: {n} names, {len(self.camera_ids)} cameras, {self.cam_from_world.shape}")
+            raise ValueError(f"ExternalModel: {n} names, {len(self.camera_ids)} cameras, {self.cam_from_world.shape}")
         if missing := set(self.camera_ids) - set(self.cameras):
-            raise ValueError(f"ForeignModel: no intrinsics for cameras {sorted(missing)}")
+            raise ValueError(f"ExternalModel: no intrinsics for cameras {sorted(missing)}")
 
     def __len__(self) -> int:
         return len(self.names)
 
 
-def read_colmap_model(folder: Path) -> ForeignModel:
+def read_colmap_model(folder: Path) -> ExternalModel:
     """Read the model in ``folder``, binary or text; see ``colmap_records`` for where it is looked for.
 
     Points may be missing altogether. Tracks are kept where two images or more of the model stand in them;
@@ -110,7 +110,7 @@ def read_colmap_model(folder: Path) -> ForeignModel:
     _refuse_twins([(name, record.place) for name, record in zip(names, posed, strict=True)], "image name")
     cameras = {record.camera_id: record for record in records.cameras}
     first_image_of = {record.camera_id: record for record in reversed(posed)}
-    model = ForeignModel(
+    model = ExternalModel(
         folder=records.folder,
         names=tuple(names),
         camera_ids=tuple(record.camera_id for record in posed),

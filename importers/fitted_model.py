@@ -21,7 +21,7 @@ import pycolmap
 from smust3r_colmap.config import ImportConfig
 from smust3r_colmap.errors import ConfigError, InputError
 from smust3r_colmap.geometry.camera import Intrinsics
-from smust3r_colmap.importers.colmap_model import MIN_IMAGES, ForeignModel, SurfacePoints
+from smust3r_colmap.importers.colmap_model import MIN_IMAGES, ExternalModel, SurfacePoints
 from smust3r_colmap.importers.image_folder import FolderScan, natural_key, shared_prior
 from smust3r_colmap.importers.images import Photo
 from smust3r_colmap.products import ImageCollection, PointCloud, RejectedImage, Scene, SourceImage
@@ -43,7 +43,7 @@ _NAMES_SHOWN = 5
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FittedModel:
-    """A foreign model whose images are files that can be read.
+    """A external model whose images are files that can be read.
 
     Args:
         collection: the images of the model, in natural order of their names, and behind them those of the folder
@@ -51,13 +51,13 @@ class FittedModel:
             of the files.
         cam_from_world: (N, 3, 4) rigid, of the first N images of the collection.
         surface: the model's points; images by their index in the collection.
-        remarks: what was assumed or changed, one sentence each, with numbers.
+        notes: what was assumed or changed, one sentence each, with numbers.
     """
 
     collection: ImageCollection
     cam_from_world: npt.NDArray[np.float64]
     surface: SurfacePoints
-    remarks: tuple[str, ...]
+    notes: tuple[str, ...]
 
     def __post_init__(self) -> None:
         n = len(self.cam_from_world)
@@ -88,7 +88,7 @@ class FittedModel:
     def scene(self, origin: str) -> Scene:
         """As what a stitched run has before its refinement; ``origin`` says where it comes from.
 
-        A foreign model never says what its unit is, so the scene is not metric.
+        A external model never says what its unit is, so the scene is not metric.
         """
         images = self.collection.images[: self.num_posed]
         return Scene(
@@ -104,7 +104,7 @@ class FittedModel:
 
 
 def fit_to_images(
-    model: ForeignModel,
+    model: ExternalModel,
     scan: FolderScan,
     *,
     share_cameras: bool = True,
@@ -135,8 +135,8 @@ def fit_to_images(
         raise ConfigError(
             f"--camera-model {camera_model}: with --calibrated the cameras stay as they are; leave one out"
         )
-    remarks = list(model.repairs)
-    matched, unused, rejected = _match_files(model, scan, remarks)
+    notes = list(model.repairs)
+    matched, unused, rejected = _match_files(model, scan, notes)
     order = sorted(matched, key=lambda position: natural_key(matched[position].name))
     files = [matched[position] for position in order]
     owners = [model.camera_ids[position] for position in order]
@@ -144,23 +144,23 @@ def fit_to_images(
         _resized_to_file(model.cameras[owner], file, f"{owner} of {model.folder}")
         for owner, file in zip(owners, files, strict=True)
     ]
-    _remark_on_sizes([model.cameras[owner] for owner in owners], resized, remarks)
+    _remark_on_sizes([model.cameras[owner] for owner in owners], resized, notes)
     keys: list[Hashable] = [(owner, file.size) for owner, file in zip(owners, files, strict=True)]
     if share_cameras and not calibrated:
-        keys = _shared_keys(keys, resized, files, remarks)
+        keys = _shared_keys(keys, resized, files, notes)
     cameras, camera_of = _one_per_key(keys, resized)
     if not calibrated:
-        cameras = _remodelled(cameras, camera_model, remarks)
+        cameras = _remodelled(cameras, camera_model, notes)
     others = [*model.unposed, *rejected]
     if complete:
         owned = list(zip(files, camera_of, strict=True))
         guessed_model = camera_model or ImportConfig.camera_model
         cameras, owned_by_others, without_camera = _cameras_of_others(
-            unused, owned, cameras, guessed_model, calibrated, remarks
+            unused, owned, cameras, guessed_model, calibrated, notes
         )
         files, camera_of = [*files, *owned_by_others], (*camera_of, *owned_by_others.values())
         others = [*_of_no_file(model.unposed, unused), *rejected, *without_camera]
-    _remark_on_unused([] if complete else unused, remarks)
+    _remark_on_unused([] if complete else unused, notes)
     images = tuple(
         SourceImage(
             name=file.name,
@@ -176,7 +176,7 @@ def fit_to_images(
         collection=ImageCollection(images=images, cameras=cameras, rejected=tuple(others), calibrated=calibrated),
         cam_from_world=model.cam_from_world[order],
         surface=_renumbered(model.surface, order, len(model)),
-        remarks=tuple(remarks),
+        notes=tuple(notes),
     )
 
 
@@ -224,7 +224,7 @@ _SPELLINGS: Mapping[str, Callable[[str], str]] = {
 
 
 def _match_files(
-    model: ForeignModel, scan: FolderScan, remarks: list[str]
+    model: ExternalModel, scan: FolderScan, notes: list[str]
 ) -> tuple[dict[int, _File], list[_File], list[RejectedImage]]:
     """The file of each image by its position in the model, files of no image, and the images without a usable file."""
     reasons = {one.name: one.reason for one in scan.unreadable}
@@ -234,7 +234,7 @@ def _match_files(
         for record in scan.records
         if record.photo is not None
     }
-    found = _found_names(model, [*usable, *reasons], scan, remarks)
+    found = _found_names(model, [*usable, *reasons], scan, notes)
     matched = {position: usable[name] for position, name in found.items() if name in usable}
     rejected = [
         RejectedImage(name=model.names[p], reason=reasons[name]) for p, name in found.items() if name in reasons
@@ -263,15 +263,13 @@ def _of_no_file(images: Iterable[RejectedImage], files: Iterable[_File]) -> list
     return left
 
 
-def _remark_on_unused(unused: Sequence[_File], remarks: list[str]) -> None:
+def _remark_on_unused(unused: Sequence[_File], notes: list[str]) -> None:
     if unused:
         names = _few(file.name for file in unused)
-        remarks.append(f"{len(unused)} files of the folder are not in the model and stay out (--complete): {names}")
+        notes.append(f"{len(unused)} files of the folder are not in the model and stay out (--complete): {names}")
 
 
-def _found_names(
-    model: ForeignModel, file_names: Sequence[str], scan: FolderScan, remarks: list[str]
-) -> dict[int, str]:
+def _found_names(model: ExternalModel, file_names: Sequence[str], scan: FolderScan, notes: list[str]) -> dict[int, str]:
     """File names by the position of their image; an image that no spelling finds is left out."""
     found: dict[int, str] = {}
     for how, spelling in _SPELLINGS.items():
@@ -291,7 +289,7 @@ def _found_names(
         found |= newly
         if newly and how != "name":
             position, name = next(iter(newly.items()))
-            remarks.append(f"{len(newly)} images found by their {how}, such as {model.names[position]!r} as {name!r}")
+            notes.append(f"{len(newly)} images found by their {how}, such as {model.names[position]!r} as {name!r}")
     image_of: dict[str, str] = {}
     for position, name in found.items():
         if name in image_of:
@@ -333,18 +331,18 @@ def _relative_difference(value: float, reference: float) -> float:
     return abs(value / reference - 1)
 
 
-def _remark_on_sizes(before: Sequence[Intrinsics], after: Sequence[Intrinsics], remarks: list[str]) -> None:
+def _remark_on_sizes(before: Sequence[Intrinsics], after: Sequence[Intrinsics], notes: list[str]) -> None:
     changes = Counter(
         f"{old.width}x{old.height} to {new.width}x{new.height}"
         for old, new in zip(before, after, strict=True)
         if (old.width, old.height) != (new.width, new.height)
     )
     for change, count in changes.items():
-        remarks.append(f"{count} images had intrinsics at another size than their files: rescaled from {change} px")
+        notes.append(f"{count} images had intrinsics at another size than their files: rescaled from {change} px")
 
 
 def _shared_keys(
-    keys: Sequence[Hashable], cameras: Sequence[Intrinsics], files: Sequence[_File], remarks: list[str]
+    keys: Sequence[Hashable], cameras: Sequence[Intrinsics], files: Sequence[_File], notes: list[str]
 ) -> list[Hashable]:
     """One key for cameras that are the same but for scatter; a camera that had several images keeps its own."""
     num_images = Counter(keys)
@@ -361,7 +359,7 @@ def _shared_keys(
         for k in alike:
             shared[k] = source
         focals = sorted(cameras[k].focal_px for k in alike)
-        remarks.append(
+        notes.append(
             f"{len(alike)} cameras with one image each became one; their focal lengths were {focals[0]:.0f} to "
             f"{focals[-1]:.0f} px"
         )
@@ -389,7 +387,7 @@ def _cameras_of_others(
     cameras: tuple[Intrinsics, ...],
     guessed_model: str,
     calibrated: bool,
-    remarks: list[str],
+    notes: list[str],
 ) -> tuple[tuple[Intrinsics, ...], dict[_File, int], list[RejectedImage]]:
     """All cameras, the number of the camera of each further file, and the files that are left out for want of one.
 
@@ -410,7 +408,7 @@ def _cameras_of_others(
         camera_of[file] = number_of[file.source]
     if guesses := len(grown) - len(cameras):
         count = sum(camera >= len(cameras) for camera in camera_of.values())
-        remarks.append(
+        notes.append(
             f"{guesses} cameras were guessed as {guessed_model}, from EXIF or the image size, for {count} images like "
             "none of the model"
         )
@@ -421,14 +419,14 @@ _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
 """Models that mean the same by a parameter of the same name."""
 
 
-def _remodelled(cameras: Sequence[Intrinsics], wanted: str, remarks: list[str]) -> tuple[Intrinsics, ...]:
+def _remodelled(cameras: Sequence[Intrinsics], wanted: str, notes: list[str]) -> tuple[Intrinsics, ...]:
     """All cameras in the model ``wanted``, or, where it is empty, pinholes of square pixels as SIMPLE_RADIAL."""
     if wanted:
         return tuple(_converted(camera, wanted) for camera in cameras)
     changed = tuple(_converted(camera, "SIMPLE_RADIAL") if _may_be_radial(camera) else camera for camera in cameras)
     count = sum(new != old for new, old in zip(changed, cameras, strict=True))
     if count:
-        remarks.append(
+        notes.append(
             f"pinhole cameras became SIMPLE_RADIAL ({count} of {len(cameras)}), for photographs are distorted; "
             "--camera-model PINHOLE keeps them, for undistorted images"
         )

@@ -190,8 +190,8 @@ def natural_key(name: str) -> tuple[Hashable, ...]:
 
 
 def _numbers_by_value(text: str) -> tuple[str | int, ...]:
-    pieces = re.split("([0-9]+)", text.casefold())
-    return tuple(int(piece) if position % 2 else piece for position, piece in enumerate(pieces))
+    submodels = re.split("([0-9]+)", text.casefold())
+    return tuple(int(submodel) if position % 2 else submodel for position, submodel in enumerate(submodels))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -37,7 +37,7 @@ import numpy as np
 from compare_with_colmap import DATA, SUBSET_FILE, open_dataset
 from plot_trajectory import Trajectories, draw_trajectories, read_tum_by_name
 
-from smust3r_colmap.alignment.pairwise import align_pieces
+from smust3r_colmap.alignment.pairwise import align_submodels
 from smust3r_colmap.backbones.base import BackboneResult
 from smust3r_colmap.config import (
     AlignmentEdges,
@@ -56,7 +56,7 @@ from smust3r_colmap.products import Edges, Segment
 from smust3r_colmap.segmentation.loop_segments import LoopPlan, PlannedLoop, plan_loops
 from smust3r_colmap.segmentation.windows import plan_windows
 from smust3r_colmap.stitching.camera_fusion import fuse_cameras
-from smust3r_colmap.stitching.resection import PlacedPiece, place_piece
+from smust3r_colmap.stitching.resection import PlacedSubmodel, place_submodel
 from smust3r_colmap.stitching.spanning_tree import ChainedPart
 from smust3r_colmap.stitching.stitch import Stitching, stitch
 from smust3r_colmap.synthetic.backbone import OracleBackbone, oracle_maps
@@ -238,8 +238,8 @@ def solve(
         DegenerateAlignmentError: a projective chain sends a camera to infinity.
     """
     loop_segments = frozenset(segment.index for segment in segments if segment.kind == "loop")
-    edges = align_pieces(
-        result.pieces,
+    edges = align_submodels(
+        result.submodels,
         result.dense,
         result.links,
         config.alignment,
@@ -248,7 +248,7 @@ def solve(
         advance=lambda _: None,
     )
     stitching = stitch(
-        result.pieces,
+        result.submodels,
         edges.alignments,
         loops,
         group=GROUPS[config.alignment.transform_group],
@@ -263,8 +263,8 @@ def largest_trajectory(
     result: BackboneResult, parts: Sequence[ChainedPart], loop_segments: frozenset[int], names: Sequence[str]
 ) -> tuple[dict[str, np.ndarray], float]:
     """``world_from_cam`` by name of the part with most images, and its median residual in pixels."""
-    part = max(parts, key=lambda part: len({image for p in part.pieces for image in result.pieces[p].images}))
-    cameras = fuse_cameras(placed_pieces(result, part, loop_segments))
+    part = max(parts, key=lambda part: len({image for p in part.submodels for image in result.submodels[p].images}))
+    cameras = fuse_cameras(placed_submodels(result, part, loop_segments))
     trajectory = {
         names[image]: pose for image, pose in zip(cameras.images, invert_rigid(cameras.cam_from_world), strict=True)
     }
@@ -272,13 +272,15 @@ def largest_trajectory(
     return trajectory, float(np.median(residual_px)) if len(residual_px) else math.nan
 
 
-def placed_pieces(result: BackboneResult, part: ChainedPart, loop_segments: frozenset[int]) -> tuple[PlacedPiece, ...]:
-    """The pieces of a part with their cameras in its world."""
+def placed_submodels(
+    result: BackboneResult, part: ChainedPart, loop_segments: frozenset[int]
+) -> tuple[PlacedSubmodel, ...]:
+    """The submodels of a part with their cameras in its world."""
     return tuple(
-        place_piece(
-            result.pieces[p], result.dense[p], world_from_seg, is_loop=result.pieces[p].segment in loop_segments
+        place_submodel(
+            result.submodels[p], result.dense[p], world_from_seg, is_loop=result.submodels[p].segment in loop_segments
         )
-        for p, world_from_seg in zip(part.pieces, part.world_from_seg, strict=True)
+        for p, world_from_seg in zip(part.submodels, part.world_from_seg, strict=True)
     )
 
 
@@ -309,14 +311,14 @@ class OracleSet:
         windows, plan = plan_segments(backbone, config)
         segments = (*windows, *(loop.segment for loop in plan.loops))
         result = backbone.reconstruct(segments, with_maps=range(len(segments)))
-        mislaid = {maps.piece.segment for maps in oracle_maps(result) if maps.geometry.mislaid}
+        mislaid = {maps.submodel.segment for maps in oracle_maps(result) if maps.geometry.mislaid}
         started = time.process_time()
         solved = solve(result, segments, plan.loops, self.truth.names, config)
         seconds = time.process_time() - started
         truth = dict(zip(self.truth.names, self.truth.world_from_cam, strict=True))
         before, after = (compare_trajectories(one, truth) for one in (solved.before, solved.after))
         false = [loop.segment.index in mislaid for loop in plan.loops]
-        accepted = [verdict.accepted for verdict in solved.stitching.verdicts]
+        accepted = [decision.accepted for decision in solved.stitching.decisions]
         sound = [edge for edge in solved.edges.alignments if edge.accepted]
         outcome = Outcome(
             ape=after.position_rmse,

@@ -37,14 +37,14 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.alignment.from_pointmaps import NUM_PIXELS, align_pointmaps
-from smust3r_colmap.alignment.seen_points import PieceFit, align_seen_points
+from smust3r_colmap.alignment.seen_points import SubmodelFit, align_seen_points
 from smust3r_colmap.config import AlignmentConfig, TransformGroup
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.sl4 import SL4
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.products import SegmentPiece
+from smust3r_colmap.products import Submodel
 
 Outliers = Literal["none", "blob", "random"]
 
@@ -209,7 +209,7 @@ class Room:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapsInMemory:
-    """`DenseMaps` of one piece."""
+    """`DenseMaps` of one submodel."""
 
     points_seg: npt.NDArray[np.float32]
     depth_seg: npt.NDArray[np.float32]
@@ -276,12 +276,12 @@ def segment_points(
     return points, depth
 
 
-def as_piece(room: Room, segment: int) -> SegmentPiece:
-    """The room's cameras as a piece; the alignment by pointmaps asks only which images it has."""
+def as_submodel(room: Room, segment: int) -> Submodel:
+    """The room's cameras as a submodel; the alignment by pointmaps asks only which images it has."""
     n = len(room.room_from_cam)
-    return SegmentPiece(
+    return Submodel(
         segment=segment,
-        piece=0,
+        submodel=0,
         images=tuple(range(n)),
         seg_from_cam=room.room_from_cam,
         intrinsics=(room.camera,) * n,
@@ -309,14 +309,14 @@ def score_maps(room: Room, overlap: Overlap, settings: AlignmentConfig, *, num_p
     target_maps, source_maps, target_from_room = overlap_maps(room, overlap, SOURCE_FROM_TARGET, seed=seed)
     began = time.process_time()
     fit = align_pointmaps(
-        as_piece(room, 0), as_piece(room, 1), target_maps, source_maps, settings, num_pixels=num_pixels
+        as_submodel(room, 0), as_submodel(room, 1), target_maps, source_maps, settings, num_pixels=num_pixels
     )
     cpu_s = time.process_time() - began
     return score_fit(room, fit, target_from_room, SOURCE_FROM_TARGET @ target_from_room, cpu_s)
 
 
 def score_fit(
-    room: Room, fit: PieceFit, target_from_room: Transform, source_from_room: Transform, cpu_s: float
+    room: Room, fit: SubmodelFit, target_from_room: Transform, source_from_room: Transform, cpu_s: float
 ) -> Score:
     """How far a fit is off in the room, at the exact points of every 16th pixel."""
     estimate = fit.estimate.b_from_a
@@ -420,9 +420,9 @@ def print_groups(room: Room, arguments: argparse.Namespace) -> None:
 
         def align(
             group: TransformGroup = group, target: MapsInMemory = target_maps, source: MapsInMemory = source_maps
-        ) -> PieceFit:
+        ) -> SubmodelFit:
             settings = AlignmentConfig(transform_group=group)
-            return align_pointmaps(as_piece(room, 0), as_piece(room, 1), target, source, settings)
+            return align_pointmaps(as_submodel(room, 0), as_submodel(room, 1), target, source, settings)
 
         began = time.process_time()
         fit = align()

@@ -164,7 +164,7 @@ def peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def verdict(ring: Ring, solution: GraphSolution) -> str:
+def decision(ring: Ring, solution: GraphSolution) -> str:
     """How many wrong loops were rejected, and how many true ones."""
     right = int(np.isin(solution.rejected_loops, ring.wrong).sum())
     return f"{right}/{len(ring.wrong)} wrong and {len(solution.rejected_loops) - right} true rejected"
@@ -199,7 +199,7 @@ def rings(args: argparse.Namespace) -> None:
             print(
                 f"    {kernel:6s} {seconds:5.2f} s  ATE {ate(ring.world, ring.start):.3f} -> "
                 f"{ate(ring.world, solution.world_from_node):.3f}  turn {mean_turn_deg(ring.world, ring.start):.2f} -> "
-                f"{mean_turn_deg(ring.world, solution.world_from_node):.2f} deg  {verdict(ring, solution)}, "
+                f"{mean_turn_deg(ring.world, solution.world_from_node):.2f} deg  {decision(ring, solution)}, "
                 f"{solution.stop_reason} after {solution.iterations}"
             )
 
@@ -221,7 +221,7 @@ def sl4(args: argparse.Namespace) -> None:
             f"{shape[0]} segments, {shape[1]} loops, {shape[2]} wrong    VGGT-SLAM: {peers}\n"
             f"    cauchy {seconds:5.2f} s  ATE {ate(ring.world, start):.3f} -> "
             f"{ate(ring.world, solution.world_from_node):.3f}  anisotropy {anisotropy:.2f}  "
-            f"{verdict(ring, solution)}, {solution.stop_reason} after {solution.iterations}"
+            f"{decision(ring, solution)}, {solution.stop_reason} after {solution.iterations}"
         )
 
 
@@ -247,7 +247,7 @@ def sizes(args: argparse.Namespace) -> None:
         print(
             f"{steps} segments, {loops} loops, {wrong} wrong: {seconds:.2f} s, {mib:.0f} MiB, "
             f"ATE {ate(ring.world, ring.start):.2f} -> {ours:.4f} ({ours / theirs:.3f} of the solve of the true loops "
-            f"without kernel, {plain:.2f} s), {verdict(ring, solution)}, {solution.stop_reason}"
+            f"without kernel, {plain:.2f} s), {decision(ring, solution)}, {solution.stop_reason}"
         )
 
 
@@ -285,7 +285,7 @@ def _report_wrong(title: str, ring: Ring, graph: PoseGraph) -> None:
     reference, _ = timed(ring.without_wrong(), ring.start, "none")
     ratio = ate(ring.world, solution.world_from_node) / ate(ring.world, reference.world_from_node)
     print(
-        f"{title}: {verdict(ring, solution)}, ATE ratio {ratio:.3f}, {seconds:.2f} s, scale found "
+        f"{title}: {decision(ring, solution)}, ATE ratio {ratio:.3f}, {seconds:.2f} s, scale found "
         f"{solution.information_scale:.2f}, {solution.stop_reason}"
     )
 

@@ -273,7 +273,7 @@ def judge(method: str, dataset: Dataset, sparse: Path, costs: dict[str, Cost]) -
     """Measure the largest model in a folder of models, and compare it with the truth."""
     folders = [folder for folder in sorted(sparse.glob("*")) if any(folder.glob("images.*"))]
     models = sorted(((read_reference_sparse(folder), folder) for folder in folders), key=lambda one: -len(one[0]))
-    remarks = [f"{stage}: exit code {cost.exit_code}" for stage, cost in costs.items() if cost.exit_code]
+    notes = [f"{stage}: exit code {cost.exit_code}" for stage, cost in costs.items() if cost.exit_code]
     evaluation, figures = None, None
     largest: Trajectory = {}
     if models:
@@ -282,9 +282,9 @@ def judge(method: str, dataset: Dataset, sparse: Path, costs: dict[str, Cost]) -
         try:
             evaluation = compare_trajectories(largest, dataset.truth)
         except DegenerateAlignmentError as error:
-            remarks.append(str(error))
+            notes.append(str(error))
     else:
-        remarks.append("no model")
+        notes.append("no model")
     return Result(
         method=method,
         costs=costs,
@@ -294,7 +294,7 @@ def judge(method: str, dataset: Dataset, sparse: Path, costs: dict[str, Cost]) -
         figures=figures,
         evaluation=evaluation,
         jumps=None if dataset.name in UNORDERED else untrue_jumps(largest, dataset.truth, dataset.names),
-        remark="; ".join(remarks),
+        note="; ".join(notes),
         workers=usable_cores(),
         stages={},
     )

@@ -1,6 +1,6 @@
 """What the comparison with COLMAP measures and what it wants: pure figures, no processes, no tables.
 
-A ``Result`` is one method on one set; ``verdicts`` holds our result against those of COLMAP's mappers.
+A ``Result`` is one method on one set; ``decisions`` holds our result against those of COLMAP's mappers.
 The next module to read is ``comparison_report``, which makes tables of both; ``compare_with_colmap`` runs
 the methods.
 """
@@ -130,7 +130,7 @@ class Result:
     figures: ModelFigures | None
     evaluation: Evaluation | None
     jumps: tuple[Jump, ...] | None
-    remark: str
+    note: str
     workers: int
     stages: Mapping[str, Evaluation]
 
@@ -232,12 +232,12 @@ def costs_by_stage(whole: Cost, stages: Sequence[Mapping[str, Any]]) -> dict[str
     return costs
 
 
-# ----------------------------------------------------------------------------- verdicts
-def verdicts(dataset: Dataset, ours: Result, mappers: Sequence[Result]) -> tuple[Verdict, ...]:
+# ----------------------------------------------------------------------------- decisions
+def decisions(dataset: Dataset, ours: Result, mappers: Sequence[Result]) -> tuple[Verdict, ...]:
     """Ours against the better of COLMAP's mappers, and its cost against the incremental one's.
 
     The better one is found figure by figure. A mapper that failed, that is placed less than half of the
-    images or has nothing in common with the truth, is no yardstick; without one there is no verdict.
+    images or has nothing in common with the truth, is no yardstick; without one there is no decision.
     """
     sound = [one for one in mappers if is_sound(dataset, one)]
     found = [_registered(dataset, ours, mappers)]

@@ -10,14 +10,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from comparison_figures import GLOBAL, INCREMENTAL, Dataset, Result, Verdict, verdicts
+from comparison_figures import GLOBAL, INCREMENTAL, Dataset, Result, Verdict, decisions
 
 MET, MISSED = "met", "MISSED"
 
 
 # ----------------------------------------------------------------------------- terminal
 def render_table(dataset: Dataset, results: Sequence[Result]) -> str:
-    """One line per method, and under it the verdicts on ours."""
+    """One line per method, and under it the decisions on ours."""
     header = ["method", "images", "models", f"rms {dataset.unit}", "% extent", "rot deg med", "mean"]
     header += ["px", "track", "points", "obs/image", "jumps"]
     header += ["CPU/wall s feat", "match", "map", "rest", "all", "MiB", ""]
@@ -26,7 +26,7 @@ def render_table(dataset: Dataset, results: Sequence[Result]) -> str:
     blocks = [title, _aligned(lines)]
     mappers = [result for result in results if not result.is_ours]
     for ours in (result for result in results if result.is_ours):
-        found = verdicts(dataset, ours, mappers)
+        found = decisions(dataset, ours, mappers)
         if found:
             blocks.append(f"{ours.method} beside COLMAP:\n" + "\n".join(f"  {_sentence(one)}" for one in found))
     return "\n".join(blocks)
@@ -73,19 +73,19 @@ def _line(result: Result, num_images: int) -> list[str]:
         *stages,
         f"{sum(cost.cpu_s for cost in costs.values()):.0f}/{sum(cost.wall_s for cost in costs.values()):.0f}",
         f"{max(cost.peak_mib for cost in costs.values()):.0f}",
-        result.remark,
+        result.note,
     ]
 
 
-def _sentence(verdict: Verdict) -> str:
-    target = f"; {verdict.target}: {_mark(verdict)}" if verdict.target else ""
-    return f"{verdict.figure}: {verdict.ours:.4g} to {verdict.yardstick:.4g}, {_times(verdict.ratio)}{target}"
+def _sentence(decision: Verdict) -> str:
+    target = f"; {decision.target}: {_mark(decision)}" if decision.target else ""
+    return f"{decision.figure}: {decision.ours:.4g} to {decision.yardstick:.4g}, {_times(decision.ratio)}{target}"
 
 
-def _mark(verdict: Verdict) -> str:
-    if verdict.met is None:
+def _mark(decision: Verdict) -> str:
+    if decision.met is None:
         return ""
-    return MET if verdict.met else MISSED
+    return MET if decision.met else MISSED
 
 
 def _times(ratio: float) -> str:
@@ -159,7 +159,7 @@ _COLUMNS: tuple[tuple[str, Number], ...] = (
 def _markdown_row(dataset: Dataset, ours: Result, results: Sequence[Result]) -> list[str]:
     by_method = {result.method: result for result in results}
     mappers = [by_method[name] for name in (INCREMENTAL, GLOBAL) if name in by_method]
-    found = {one.figure: one for one in verdicts(dataset, ours, mappers)}
+    found = {one.figure: one for one in decisions(dataset, ours, mappers)}
     cells = [f"{dataset.name} ({dataset.num_images}, {dataset.unit}), {ours.method}"]
     for name, number in _COLUMNS:
         theirs = [number(by_method[one]) if one in by_method else "-" for one in (INCREMENTAL, GLOBAL)]
@@ -200,7 +200,7 @@ def as_json(dataset: Dataset, results: Sequence[Result]) -> list[dict[str, Any]]
                 "evaluation": None if result.evaluation is None else _facts(result.evaluation),
                 "jumps": None if result.jumps is None else [asdict(jump) for jump in result.jumps],
                 "stages": {stage: _facts(found) for stage, found in result.stages.items()},
-                "verdicts": [asdict(one) for one in verdicts(dataset, result, mappers)] if result.is_ours else [],
+                "decisions": [asdict(one) for one in decisions(dataset, result, mappers)] if result.is_ours else [],
             }
         )
         for result in results

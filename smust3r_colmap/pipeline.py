@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from smust3r_colmap.alignment.pairwise import align_pieces, candidate_pairs, needs_maps
+from smust3r_colmap.alignment.pairwise import align_submodels, candidate_pairs, needs_maps
 from smust3r_colmap.backbones.base import Backbone, BackboneContext, BackboneFactory, BackboneResult
 from smust3r_colmap.backbones.masked_maps import without_masked_depth
 from smust3r_colmap.backbones.registry import make_backbone, read_options
@@ -40,7 +40,7 @@ from smust3r_colmap.execution.progress import Reporter
 from smust3r_colmap.execution.stage_clock import StageClock, peak_memory_bytes
 from smust3r_colmap.execution.task_pool import usable_cores
 from smust3r_colmap.exporters.atomic_write import replace_file
-from smust3r_colmap.exporters.registry import FORMATS, FormatSettings, write_where_possible
+from smust3r_colmap.exporters.registry import FORMATS, FormatSettings, Outputs, write_where_possible
 from smust3r_colmap.exporters.tum_trajectory import write_tum
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.groups import GROUPS
@@ -59,18 +59,17 @@ from smust3r_colmap.products import (
     DepthMaps,
     Edges,
     ImageCollection,
-    Outputs,
     PointCloud,
     Scene,
     Segment,
-    SegmentPiece,
+    Submodel,
     largest_first,
 )
 from smust3r_colmap.refinement.stage import Refinement, refine
 from smust3r_colmap.report.summary import (
     EdgeSummary,
     GraphSummary,
-    ImageRemark,
+    ImageNote,
     LoopSummary,
     ModelSummary,
     RefinementStep,
@@ -87,7 +86,7 @@ from smust3r_colmap.stitching.camera_fusion import (
     fuse_cameras,
     fuse_intrinsics,
 )
-from smust3r_colmap.stitching.resection import PlacedPiece, place_piece
+from smust3r_colmap.stitching.resection import PlacedSubmodel, place_submodel
 from smust3r_colmap.stitching.spanning_tree import ChainedPart
 from smust3r_colmap.stitching.stitch import Stitching, stitch
 from smust3r_colmap.storage.alignments import read_edges, write_edges
@@ -233,8 +232,8 @@ def _segments_with_maps(backbone: Backbone, segments: tuple[Segment, ...], confi
 
 
 def _refuse_nothing(result: BackboneResult, collection: ImageCollection) -> None:
-    """Say what was tried when no segment gave a single piece."""
-    if result.pieces:
+    """Say what was tried when no segment gave a single submodel."""
+    if result.submodels:
         return
     attempts = [f"segment {one.segment}: {'; '.join(one.attempts)}" for one in result.reconstructions]
     raise ReconstructionError(
@@ -247,19 +246,21 @@ def _refuse_nothing(result: BackboneResult, collection: ImageCollection) -> None
 def _align(
     result: BackboneResult, segments: tuple[Segment, ...], config: RunConfig, run: RunDirectory, clock: StageClock
 ) -> Edges:
-    """Transforms between all pieces that have something in common (paper eqs. 1 to 3)."""
+    """Transforms between all submodels that have something in common (paper eqs. 1 to 3)."""
     loops = frozenset(segment.index for segment in segments if segment.kind == "loop")
-    num_pairs = len(candidate_pairs(result.pieces, loops))
-    geometry = [(piece.name, piece.images, piece.seg_from_cam, piece.tracks) for piece in result.pieces]
-    maps = result.dense_key if needs_maps(result.pieces, config.alignment) else None
+    num_pairs = len(candidate_pairs(result.submodels, loops))
+    geometry = [
+        (submodel.name, submodel.images, submodel.seg_from_cam, submodel.tracks) for submodel in result.submodels
+    ]
+    maps = result.dense_key if needs_maps(result.submodels, config.alignment) else None
     inputs = (geometry, maps, result.links, sorted(loops))
     stored = run.stage("alignment", key=key_of("alignment", inputs, config.alignment, config.seed))
     with clock.stage("alignment", total=num_pairs) as stage:
         if stored.is_done:
             stage.skip(num_pairs)
         else:
-            edges = align_pieces(
-                result.pieces,
+            edges = align_submodels(
+                result.submodels,
                 result.dense,
                 result.links,
                 config.alignment,
@@ -288,7 +289,7 @@ def _stitch(
     """Loops proven or refused, one frame for whatever hangs together."""
     with clock.stage("pose graph", total=1) as stage:
         stitching = stitch(
-            result.pieces,
+            result.submodels,
             edges.alignments,
             plan.loops,
             group=GROUPS[config.alignment.transform_group],
@@ -318,7 +319,8 @@ def _place(
 ) -> _Stitched:
     """Every image once, one camera set and one depth map for every connected part, largest first."""
     inputs = [
-        [_scene_input(result.pieces[p], world_from, collection) for p, world_from in _members(part)] for part in parts
+        [_scene_input(result.submodels[p], world_from, collection) for p, world_from in _members(part)]
+        for part in parts
     ]
     kinds = [segment.kind for segment in segments]
     stored = run.stage("stitched", key=key_of("stitched", inputs, kinds, result.dense_key))
@@ -330,7 +332,7 @@ def _place(
                 scenes = []
                 maps = DepthMapWriter(folder)
                 for part in sorted(parts, key=lambda part: -_num_images(part, result)):
-                    placed = _placed_pieces(part, result, segments)
+                    placed = _placed_submodels(part, result, segments)
                     cameras = fuse_cameras(placed)
                     scenes.append(_scene(placed, cameras, EMPTY_CLOUD, result, collection))
                     for image, depth, confidence in depth_in_cameras(placed, _dense(part, result), cameras):
@@ -380,7 +382,7 @@ def _fuse(
     scenes = stitched.scenes if refinement is None else refinement.scenes
     inputs = [(scene.image_names, scene.cam_from_world, scene.cameras, scene.segments) for scene in scenes]
     stored = run.stage("scene", key=key_of("scene", inputs, result.dense_key, config.fusion))
-    part_of = {tuple(result.pieces[p].name for p in part.pieces): part for part in parts}
+    part_of = {tuple(result.submodels[p].name for p in part.submodels): part for part in parts}
     with clock.stage("fusion", total=len(scenes)) as stage:
         if stored.is_done:
             stage.skip(len(scenes))
@@ -388,7 +390,7 @@ def _fuse(
         fused = []
         for number, scene in enumerate(scenes):
             part = part_of[scene.segments]
-            placed = _placed_pieces(part, result, segments)
+            placed = _placed_submodels(part, result, segments)
             cameras, scale = _cameras_of(scene, fuse_cameras(placed), number, refinement, stitched.maps)
             cloud = fuse_points(
                 placed,
@@ -419,27 +421,29 @@ def _cameras_of(
 
 
 def _dense(part: ChainedPart, result: BackboneResult) -> list[DenseMaps]:
-    return [result.dense[p] for p in part.pieces]
+    return [result.dense[p] for p in part.submodels]
 
 
 def _num_images(part: ChainedPart, result: BackboneResult) -> int:
-    return len({image for p in part.pieces for image in result.pieces[p].images})
+    return len({image for p in part.submodels for image in result.submodels[p].images})
 
 
-def _placed_pieces(part: ChainedPart, result: BackboneResult, segments: tuple[Segment, ...]) -> tuple[PlacedPiece, ...]:
+def _placed_submodels(
+    part: ChainedPart, result: BackboneResult, segments: tuple[Segment, ...]
+) -> tuple[PlacedSubmodel, ...]:
     return tuple(
-        place_piece(
-            result.pieces[p],
+        place_submodel(
+            result.submodels[p],
             result.dense[p],
             world_from_seg,
-            is_loop=segments[result.pieces[p].segment].kind == "loop",
+            is_loop=segments[result.submodels[p].segment].kind == "loop",
         )
         for p, world_from_seg in _members(part)
     )
 
 
 def _scene(
-    placed: tuple[PlacedPiece, ...],
+    placed: tuple[PlacedSubmodel, ...],
     cameras: FusedCameras,
     cloud: PointCloud,
     result: BackboneResult,
@@ -448,21 +452,21 @@ def _scene(
     intrinsics = fuse_intrinsics(placed, [image.camera for image in collection.images])
     if collection.calibrated:
         intrinsics = {camera: collection.cameras[camera] for camera in intrinsics}
-    metric = all(result.reconstructions[one.piece.segment].metric for one in placed)
+    metric = all(result.reconstructions[one.submodel.segment].metric for one in placed)
     return build_scene(collection, placed, cameras, intrinsics, cloud, metric=metric)
 
 
 def _members(part: ChainedPart) -> list[tuple[int, Transform]]:
-    return list(zip(part.pieces, part.world_from_seg, strict=True))
+    return list(zip(part.submodels, part.world_from_seg, strict=True))
 
 
-def _scene_input(piece: SegmentPiece, world_from_seg: Transform, collection: ImageCollection) -> tuple[object, ...]:
-    """What a piece puts into a scene besides its maps; the names too, for files may be renamed."""
-    images = [collection.images[index] for index in piece.images]
+def _scene_input(submodel: Submodel, world_from_seg: Transform, collection: ImageCollection) -> tuple[object, ...]:
+    """What a submodel puts into a scene besides its maps; the names too, for files may be renamed."""
+    images = [collection.images[index] for index in submodel.images]
     names = [(image.name, image.camera) for image in images]
-    intrinsics = collection.cameras if collection.calibrated else piece.intrinsics
-    geometry = (piece.seg_from_cam, intrinsics, piece.tracks)
-    return piece.name, type(world_from_seg).__name__, world_from_seg.matrix, piece.images, names, geometry
+    intrinsics = collection.cameras if collection.calibrated else submodel.intrinsics
+    geometry = (submodel.seg_from_cam, intrinsics, submodel.tracks)
+    return submodel.name, type(world_from_seg).__name__, world_from_seg.matrix, submodel.images, names, geometry
 
 
 def _without_repeats(scenes: tuple[Scene, ...]) -> tuple[Scene, ...]:
@@ -487,11 +491,11 @@ def _without_loops(
 
     None where no loop was closed, or where the chain alone, in SL(4), sends a camera beyond infinity.
     """
-    if not any(verdict.accepted for verdict in stitching.verdicts):
+    if not any(decision.accepted for decision in stitching.decisions):
         return None
-    part = max(stitching.chained, key=lambda part: len({i for p in part.pieces for i in result.pieces[p].images}))
+    part = max(stitching.chained, key=lambda part: len({i for p in part.submodels for i in result.submodels[p].images}))
     try:
-        placed = _placed_pieces(part, result, segments)
+        placed = _placed_submodels(part, result, segments)
     except DegenerateAlignmentError as error:
         clock.note(f"no trajectory without loops: {error}")
         return None
@@ -566,11 +570,11 @@ def _summarise(
             )
             for number, scene in enumerate(scenes)
         ),
-        rejected=tuple(ImageRemark(name=one.name, reason=one.reason) for one in collection.rejected),
+        rejected=tuple(ImageNote(name=one.name, reason=one.reason) for one in collection.rejected),
         unregistered=tuple(
-            ImageRemark(
+            ImageNote(
                 name=image.name,
-                reason=no_features.get(image.name) or why.get(index, "its segment piece was refused"),
+                reason=no_features.get(image.name) or why.get(index, "its submodel was refused"),
             )
             for index, image in enumerate(collection.images)
             if index not in placed
@@ -581,20 +585,20 @@ def _summarise(
                 index=segment.index,
                 kind=segment.kind,
                 num_images=len(segment.images),
-                num_pieces=len(one.pieces),
-                num_registered=len({image for piece in one.pieces for image in piece.images}),
-                method=one.pieces[0].method if one.pieces else "",
-                doubts=one.doubts,
+                num_submodels=len(one.submodels),
+                num_registered=len({image for submodel in one.submodels for image in submodel.images}),
+                method=one.submodels[0].method if one.submodels else "",
+                warnings=one.warnings,
             )
             for segment, one in zip(segments, result.reconstructions, strict=True)
         ),
-        edges=_edge_summaries(edges, [piece.name for piece in result.pieces]),
+        edges=_edge_summaries(edges, [submodel.name for submodel in result.submodels]),
         loops=_loop_summaries(plan, stitching, collection),
         loops_note=plan.note,
         graph=GraphSummary(
-            num_nodes=sum(len(part.pieces) for part in stitching.parts),
+            num_nodes=sum(len(part.submodels) for part in stitching.parts),
             num_edges=stitching.num_edges,
-            num_loops=sum(verdict.accepted for verdict in stitching.verdicts),
+            num_loops=sum(decision.accepted for decision in stitching.decisions),
             cost_before=stitching.solution.cost_before,
             cost_after=stitching.solution.cost_after,
             iterations=stitching.solution.iterations,
@@ -604,7 +608,7 @@ def _summarise(
         peak_memory_bytes=peak_memory_bytes(),
         refinements=() if refinement is None else refinement_summaries(refinement, collection, run),
         missing_outputs=outputs.missing,
-        remarks=outputs.remarks,
+        notes=outputs.notes,
     )
 
 
@@ -627,7 +631,7 @@ def refinement_summaries(
             weak=tuple(collection.images[i].name for i in one.weak),
             registered=tuple(collection.images[i].name for i in one.registered),
             principal_point=one.principal_point,
-            doubts=one.doubts,
+            warnings=one.warnings,
             steps=tuple(
                 RefinementStep(
                     name=step.name,
@@ -688,13 +692,13 @@ def _loop_summaries(plan: LoopPlan, stitching: Stitching, collection: ImageColle
             segment_a=loop.segment_a,
             segment_b=loop.segment_b,
             segment=loop.segment.index,
-            accepted=verdict.accepted,
-            reason=verdict.reason,
-            closure_sigmas=verdict.closure_sigmas,
+            accepted=decision.accepted,
+            reason=decision.reason,
+            closure_sigmas=decision.closure_sigmas,
             gap_before_percent=100 * before.distance,
             gap_after_percent=100 * after.distance,
             turn_before_deg=before.turn_deg,
             turn_after_deg=after.turn_deg,
         )
-        for loop, verdict, (before, after) in zip(plan.loops, stitching.verdicts, stitching.gaps, strict=True)
+        for loop, decision, (before, after) in zip(plan.loops, stitching.decisions, stitching.gaps, strict=True)
     )

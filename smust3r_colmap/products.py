@@ -1,6 +1,6 @@
 """The values that cross the border of a stage, in the order in which the pipeline makes them.
 
-Frames: ``world`` (one per model), ``seg`` (one per segment piece, its own gauge), ``cam``, ``img``.
+Frames: ``world`` (one per model), ``seg`` (one per submodel, its own gauge), ``cam``, ``img``.
 Images are numbered by their index in the collection; COLMAP ids are index + 1, everywhere.
 Every value is complete and checked when it is born. The next module to read is ``pipeline``.
 """
@@ -138,9 +138,9 @@ def consecutive_runs(images: Sequence[int]) -> tuple[tuple[int, ...], ...]:
 
 # --------------------------------------------------------------------- reconstruction
 class DenseMaps(Protocol):
-    """Per-pixel geometry of the images of one piece, read from disk when asked for.
+    """Per-pixel geometry of the images of one submodel, read from disk when asked for.
 
-    Position k runs over the images of the piece. A map of H x W pixels covers the whole image,
+    Position k runs over the images of the submodel. A map of H x W pixels covers the whole image,
     uniformly resized: ``x_orig = (j + 0.5) * width_orig / W``, and the same for y. H and W may
     differ between images.
     """
@@ -162,9 +162,9 @@ class DenseMaps(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tracks:
-    """Points of a piece seen as features of the run's database.
+    """Points of a submodel seen as features of the run's database.
 
-    Two pieces share a point when they share an (image, feature) pair.
+    Two submodels share a point when they share an (image, feature) pair.
 
     Args:
         points_seg: (P, 3) float64 in the segment frame.
@@ -207,7 +207,7 @@ class RunFeatures:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FeatureLinks:
-    """Verified matches between features of two images, which tie pieces that share no image.
+    """Verified matches between features of two images, which tie submodels that share no image.
 
     Args:
         image_a, feature_a, image_b, feature_b: (M,) each; images are indices into the collection,
@@ -226,11 +226,11 @@ class FeatureLinks:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SegmentPiece:
+class Submodel:
     """A connected part of a segment in a frame of its own; a node of the pose graph.
 
     Args:
-        segment, piece: together the name of the node.
+        segment, submodel: together the name of the node.
         images: (N,) indices into the collection, ascending, all registered.
         seg_from_cam: (N, 3, 4) rigid.
         intrinsics: one per image, at the original image size.
@@ -240,7 +240,7 @@ class SegmentPiece:
     """
 
     segment: int
-    piece: int
+    submodel: int
     images: tuple[int, ...]
     seg_from_cam: FloatArray
     intrinsics: tuple[Intrinsics, ...]
@@ -252,20 +252,20 @@ class SegmentPiece:
         n = len(self.images)
         if self.seg_from_cam.shape != (n, 3, 4) or len(self.intrinsics) != n:
             raise ValueError(
-                f"piece {self.name}: {n} images, poses {self.seg_from_cam.shape}, {len(self.intrinsics)} intrinsics"
+                f"submodel {self.name}: {n} images, poses {self.seg_from_cam.shape}, {len(self.intrinsics)} intrinsics"
             )
         if list(self.images) != sorted(set(self.images)):
-            raise ValueError(f"piece {self.name}: images must ascend without repeats")
+            raise ValueError(f"submodel {self.name}: images must ascend without repeats")
         if not np.isfinite(self.seg_from_cam).all():
-            raise ValueError(f"piece {self.name}: a pose is not finite")
+            raise ValueError(f"submodel {self.name}: a pose is not finite")
 
     @property
     def name(self) -> str:
-        """For people, such as ``3``, ``3b`` for the second piece of segment 3, or ``3.27`` after ``3z``."""
-        if self.piece == 0:
+        """For people, such as ``3``, ``3b`` for the second submodel of segment 3, or ``3.27`` after ``3z``."""
+        if self.submodel == 0:
             return str(self.segment)
-        letter = chr(ord("a") + self.piece)
-        return f"{self.segment}{letter}" if letter <= "z" else f"{self.segment}.{self.piece + 1}"
+        letter = chr(ord("a") + self.submodel)
+        return f"{self.segment}{letter}" if letter <= "z" else f"{self.segment}.{self.submodel + 1}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,23 +278,23 @@ class UnregisteredImage:
 
 @dataclass(frozen=True, kw_only=True)
 class SegmentReconstruction:
-    """What a backbone made of one segment: any number of pieces, largest first.
+    """What a backbone made of one segment: any number of submodels, largest first.
 
     Args:
         segment: index of the segment.
-        pieces: accepted pieces; empty when nothing came out.
-        unregistered: images of the segment in no piece.
+        submodels: accepted submodels; empty when nothing came out.
+        unregistered: images of the segment in no submodel.
         attempts: what was tried, in order, in words for people.
         metric: lengths are metres.
-        doubts: why the geometry, though kept, should not be trusted.
+        warnings: why the geometry, though kept, should not be trusted.
     """
 
     segment: int
-    pieces: tuple[SegmentPiece, ...]
+    submodels: tuple[Submodel, ...]
     unregistered: tuple[UnregisteredImage, ...]
     attempts: tuple[str, ...]
     metric: bool
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 # -------------------------------------------------------------------------- alignment
@@ -326,10 +326,10 @@ class TransformEstimate:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SegmentAlignment:
-    """An edge of the pose graph between two pieces.
+    """An edge of the pose graph between two submodels.
 
     Args:
-        target, source: positions in the list of all pieces of the run.
+        target, source: positions in the list of all submodels of the run.
         estimate: ``target_from_source`` with its evidence.
         evidence: ``"tracks"``, ``"pointmaps"``, ``"poses"`` of the shared images' cameras, or ``"links"``
             (matches between images).
@@ -390,7 +390,7 @@ class Scene:
         cam_from_world: (N, 3, 4) rigid.
         points: the fused cloud, in the world frame.
         metric: lengths are metres.
-        segments: names of the pieces that were stitched, the first being the world frame.
+        segments: names of the submodels that were stitched, the first being the world frame.
     """
 
     image_indices: tuple[int, ...]
@@ -443,7 +443,7 @@ def largest_first(scenes: Sequence[Scene]) -> tuple[Scene, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class TriedAlignment:
-    """Two pieces for which no transform was found, and why."""
+    """Two submodels for which no transform was found, and why."""
 
     target: int
     source: int
@@ -457,32 +457,3 @@ class Edges:
 
     alignments: tuple[SegmentAlignment, ...]
     failures: tuple[TriedAlignment, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class MissingOutput:
-    """A part of the result that could not be written, and why."""
-
-    name: str
-    reason: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class Written:
-    """What a format has written.
-
-    Args:
-        name: the file or folder, below the output folder.
-        remarks: what the user should know of it, such as what was left out.
-    """
-
-    name: str
-    remarks: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class Outputs:
-    """What came of several formats: which could not be written, and the remarks of the others."""
-
-    missing: tuple[MissingOutput, ...]
-    remarks: tuple[str, ...]

@@ -27,7 +27,7 @@ from smust3r_colmap.estimators.robust import evenly_chosen
 from smust3r_colmap.execution.progress import Reporter
 from smust3r_colmap.execution.stage_clock import StageClock, peak_memory_bytes
 from smust3r_colmap.execution.task_pool import usable_cores
-from smust3r_colmap.exporters.registry import FORMATS, FormatSettings, write_where_possible
+from smust3r_colmap.exporters.registry import FORMATS, FormatSettings, Outputs, write_where_possible
 from smust3r_colmap.exporters.tum_trajectory import write_tum
 from smust3r_colmap.features.matching import match_pairs
 from smust3r_colmap.features.pairs import alike_pairs, neighbouring_pairs
@@ -35,7 +35,7 @@ from smust3r_colmap.features.stage import describe_images, features_of_run
 from smust3r_colmap.geometry.arrays import IntArray, Pair
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.importers.colmap_model import ForeignModel, read_colmap_model
+from smust3r_colmap.importers.colmap_model import ExternalModel, read_colmap_model
 from smust3r_colmap.importers.fitted_model import FittedModel, fit_to_images
 from smust3r_colmap.importers.image_folder import (
     FolderScan,
@@ -45,9 +45,9 @@ from smust3r_colmap.importers.image_folder import (
 )
 from smust3r_colmap.importers.masks import masks_of
 from smust3r_colmap.pipeline import masked_as_wanted, refinement_summaries
-from smust3r_colmap.products import ImageCollection, Outputs, PointCloud, RunFeatures, Scene, SegmentPiece
+from smust3r_colmap.products import ImageCollection, PointCloud, RunFeatures, Scene, Submodel
 from smust3r_colmap.refinement.stage import Refinement, refine, surfaces_of_clouds
-from smust3r_colmap.report.summary import GraphSummary, ImageRemark, ModelSummary, RunSummary
+from smust3r_colmap.report.summary import GraphSummary, ImageNote, ModelSummary, RunSummary
 from smust3r_colmap.segmentation.windows import plan_windows
 from smust3r_colmap.storage.finished_run import FinishedRun, begin_stages, write_finished
 from smust3r_colmap.storage.image_scan import scan_changed_files
@@ -100,13 +100,13 @@ def refine_model(
     check_output_not_inside(images, output)
     check_masks_not_inside(images, config.importing.masks)
     check_image_folder(images)
-    foreign = read_colmap_model(model)
-    _refuse_to_overwrite(foreign.folder, output)
+    external = read_colmap_model(model)
+    _refuse_to_overwrite(external.folder, output)
     with RunDirectory(output) as run:
         clock = StageClock(reporter)
-        scan, fitted = _fit(foreign, images, config, cameras, run, clock, fresh=fresh)
+        scan, fitted = _fit(external, images, config, cameras, run, clock, fresh=fresh)
         begin_stages(run, scan, fresh=fresh)
-        start = fitted.scene(origin=foreign.folder.name)
+        start = fitted.scene(origin=external.folder.name)
         features = _features(fitted, start, config, run, clock)
         refinement = _refine(fitted, start, features, config, run, clock, tolerance=pose_tolerance)
         refinement = _doubting_the_poses(refinement)
@@ -115,7 +115,7 @@ def refine_model(
         summary = _summarise(fitted, result, features, refinement, outputs, run, clock)
         facts = {
             **summary.to_json_dict(),
-            "model_remarks": fitted.remarks,
+            "model_notes": fitted.notes,
             "settings": {"cameras": cameras, "pose_tolerance": pose_tolerance, "config": config},
         }
         write_json(run.root / "summary.json", facts)
@@ -129,7 +129,7 @@ def _refuse_to_overwrite(model: Path, output: Path) -> None:
 
 
 def _fit(
-    foreign: ForeignModel,
+    external: ExternalModel,
     images: Path,
     config: RunConfig,
     cameras: CameraChoice,
@@ -142,7 +142,7 @@ def _fit(
     with clock.stage("import", total=1) as stage:
         scan = scan_changed_files(images, run, fresh=fresh, workers=config.workers)
         fitted = fit_to_images(
-            foreign,
+            external,
             scan,
             share_cameras=cameras.share,
             camera_model=cameras.model,
@@ -153,8 +153,8 @@ def _fit(
             refuse_names_text_cannot_hold(image.name for image in fitted.collection.images)
         fitted = replace(fitted, collection=masked_as_wanted(fitted.collection, config.importing.masks, clock))
         stage.advance()
-    for remark in fitted.remarks:
-        clock.note(remark)
+    for note in fitted.notes:
+        clock.note(note)
     for rejected in fitted.collection.rejected:
         clock.warn(f"left out: {rejected.name} ({rejected.reason})")
     return scan, fitted
@@ -223,7 +223,7 @@ def _doubting_the_poses(refinement: Refinement) -> Refinement:
         "from world to camera"
     )
     doubted = (
-        replace(figures, doubts=(*figures.doubts, doubt))
+        replace(figures, warnings=(*figures.warnings, doubt))
         if figures.kept
         else replace(figures, reason=f"{figures.reason}; {doubt}")
     )
@@ -257,18 +257,18 @@ def refined_from_start(start: Scene, refined: Scene, depth: float) -> Transform:
         start, refined: the first has no image that the second lacks.
         depth: usual depth of the scene in the world of ``refined``.
     """
-    before = _cameras_as_piece(start, evenly_chosen(len(start), MAX_ALIGNED))
-    after = _cameras_as_piece(refined, np.arange(len(refined)))
+    before = _cameras_as_submodel(start, evenly_chosen(len(start), MAX_ALIGNED))
+    after = _cameras_as_submodel(refined, np.arange(len(refined)))
     try:
         return align_poses(after, before, depth_target=depth).estimate.b_from_a
     except DegenerateAlignmentError:  # the camera only turned: the priors have kept the world where it was
         return Sim3.identity()
 
 
-def _cameras_as_piece(scene: Scene, chosen: IntArray) -> SegmentPiece:
-    return SegmentPiece(
+def _cameras_as_submodel(scene: Scene, chosen: IntArray) -> Submodel:
+    return Submodel(
         segment=0,
-        piece=0,
+        submodel=0,
         images=tuple(scene.image_indices[k] for k in chosen),
         seg_from_cam=invert_rigid(scene.cam_from_world[chosen]),
         intrinsics=tuple(scene.cameras[scene.camera_indices[k]] for k in chosen),
@@ -343,7 +343,7 @@ def _summarise(
                 segments=result.segments,
             ),
         ),
-        rejected=tuple(ImageRemark(name=one.name, reason=one.reason) for one in fitted.collection.rejected),
+        rejected=tuple(ImageNote(name=one.name, reason=one.reason) for one in fitted.collection.rejected),
         unregistered=_unplaced(fitted.collection, result, features, refined=any(refinement.models)),
         stages=tuple(clock.stages),
         segments=(),
@@ -363,16 +363,16 @@ def _summarise(
         peak_memory_bytes=peak_memory_bytes(),
         refinements=refinement_summaries(refinement, fitted.collection, run),
         missing_outputs=outputs.missing,
-        remarks=(*_remarks_on_points(fitted, refinement), *outputs.remarks),
+        notes=(*_remarks_on_points(fitted, refinement), *outputs.notes),
     )
 
 
 def _unplaced(
     collection: ImageCollection, result: Scene, features: RunFeatures, *, refined: bool
-) -> tuple[ImageRemark, ...]:
+) -> tuple[ImageNote, ...]:
     """The images without a pose, and why they have none."""
     unreadable = {one.name: one.reason for one in features.rejected}
-    placed, remarks = set(result.image_indices), []
+    placed, notes = set(result.image_indices), []
     with pycolmap.Database.open(features.database) as database:
         for index, image in enumerate(collection.images):
             if index in placed:
@@ -385,8 +385,8 @@ def _unplaced(
                 reason = "the model could not be refined, and images are placed by its tracks"
             else:
                 reason = "no place was found that its matches agree with"
-            remarks.append(ImageRemark(name=image.name, reason=reason))
-    return tuple(remarks)
+            notes.append(ImageNote(name=image.name, reason=reason))
+    return tuple(notes)
 
 
 def _remarks_on_points(fitted: FittedModel, refinement: Refinement) -> tuple[str, ...]:

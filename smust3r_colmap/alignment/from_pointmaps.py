@@ -1,8 +1,8 @@
-"""Aligning two pieces by the pixels of the images they share (paper sections III-C and III-E).
+"""Aligning two submodels by the pixels of the images they share (paper sections III-C and III-E).
 
 The same pixel of the same image is the same scene point, so dense maps need no matching. A spread
 selection of confident pixels is as exact as all of them: 8,000 instead of 5.9 million for 30
-images. The solver is behind ``seen_points``; ``from_tracks`` does the same for pieces with feature tracks.
+images. The solver is behind ``seen_points``; ``from_tracks`` does the same for submodels with feature tracks.
 """
 
 from __future__ import annotations
@@ -14,27 +14,27 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.alignment.seen_points import PieceFit, align_seen_points
+from smust3r_colmap.alignment.seen_points import SubmodelFit, align_seen_points
 from smust3r_colmap.config import AlignmentConfig, ConfidenceWeighting
 from smust3r_colmap.errors import DegenerateAlignmentError, ReconstructionError
 from smust3r_colmap.estimators.confidence import reweighted
 from smust3r_colmap.estimators.robust import evenly_chosen
 from smust3r_colmap.geometry.arrays import FloatArray
-from smust3r_colmap.products import DenseMaps, SegmentPiece
+from smust3r_colmap.products import DenseMaps, Submodel
 
 NUM_PIXELS = 8_000
-"""Correspondences per pair of pieces; 5,000 to 20,000 measured alike, and the cost is 0.08 CPU s."""
+"""Correspondences per pair of submodels; 5,000 to 20,000 measured alike, and the cost is 0.08 CPU s."""
 CANDIDATES_PER_PIXEL = 2
 """Pixels looked at for each one wanted; half of them may lack depth or confidence."""
 CONFIDENCE_SHARE = 0.5
-"""Of the median confidence of a piece, which a pixel must exceed on both sides. It drops the low tail
+"""Of the median confidence of a submodel, which a pixel must exceed on both sides. It drops the low tail
 and, by construction, never more than half of a side; VGGT-Long's tenth of the median drops nothing
 where confidences start at 1."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Side:
-    """What one piece says about some pixels.
+    """What one submodel says about some pixels.
 
     Args:
         points_seg: (N, 3) float64. depth: (N,) float64. confidence: (N,) float64.
@@ -58,16 +58,16 @@ class _Side:
 
 
 def align_pointmaps(
-    target: SegmentPiece,
-    source: SegmentPiece,
+    target: Submodel,
+    source: Submodel,
     target_maps: DenseMaps,
     source_maps: DenseMaps,
     settings: AlignmentConfig,
     *,
     num_pixels: int = NUM_PIXELS,
     seed: int = 0,
-) -> PieceFit:
-    """Robust ``target_from_source`` from the pixels that both pieces reconstructed with confidence.
+) -> SubmodelFit:
+    """Robust ``target_from_source`` from the pixels that both submodels reconstructed with confidence.
 
     A pixel takes part when it has a point and a depth on both sides and its confidence exceeds, on
     each side, both 1 (none) and half of that side's median. Candidates lie on a regular grid over
@@ -75,7 +75,7 @@ def align_pointmaps(
     sqrt(c'_i c'_j), the confidences after paper eq. 1.
 
     Args:
-        target, source: pieces that share images.
+        target, source: submodels that share images.
         target_maps, source_maps: of their images, in the same order; read one image at a time.
         settings: kernel and weighting.
         num_pixels: at most this many correspondences.
@@ -84,12 +84,12 @@ def align_pointmaps(
     Raises:
         DegenerateAlignmentError: no image is shared, or the pixels do not determine the transform.
         ReconstructionError: the maps of an image differ in size.
-        ValueError: a piece and its maps differ in length.
+        ValueError: a submodel and its maps differ in length.
     """
-    for piece, maps in ((target, target_maps), (source, source_maps)):
-        if len(maps) != len(piece.images):
-            raise ValueError(f"piece {piece.name}: {len(piece.images)} images, {len(maps)} dense maps")
-    between = f"pieces {target.name} and {source.name}"
+    for submodel, maps in ((target, target_maps), (source, source_maps)):
+        if len(maps) != len(submodel.images):
+            raise ValueError(f"submodel {submodel.name}: {len(submodel.images)} images, {len(maps)} dense maps")
+    between = f"submodels {target.name} and {source.name}"
     shared = sorted(set(target.images) & set(source.images))
     if not shared:
         raise DegenerateAlignmentError(f"{between} share no image")
@@ -121,8 +121,8 @@ def align_pointmaps(
 
 
 def _shared_pixels(
-    target: SegmentPiece,
-    source: SegmentPiece,
+    target: Submodel,
+    source: Submodel,
     target_maps: DenseMaps,
     source_maps: DenseMaps,
     *,
@@ -135,7 +135,7 @@ def _shared_pixels(
         size_target, size_source = target_maps.depth(k_target).shape, source_maps.depth(k_source).shape
         if size_target != size_source:
             raise ReconstructionError(
-                f"image {image}: the maps are {size_target} in piece {target.name} and {size_source} in piece "
+                f"image {image}: the maps are {size_target} in submodel {target.name} and {size_source} in submodel "
                 f"{source.name} (rows, columns); reconstruct both at one size"
             )
         height, width = size_target

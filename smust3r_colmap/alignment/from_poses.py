@@ -1,7 +1,7 @@
-"""Aligning two pieces by the cameras of the images they share (paper eq. 3).
+"""Aligning two submodels by the cameras of the images they share (paper eq. 3).
 
 Centres alone leave the roll about a straight path free, so orientations take part: every camera of
-both pieces is a rotation and a point. It costs milliseconds and needs neither tracks nor maps;
+both submodels is a rotation and a point. It costs milliseconds and needs neither tracks nor maps;
 how far to believe it is a matter for ``uncertainty``.
 The solver works like that in ``irls``; the next module to read is ``edges``.
 """
@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from smust3r_colmap.alignment.seen_points import PieceFit
+from smust3r_colmap.alignment.seen_points import SubmodelFit
 from smust3r_colmap.config import RobustKernel
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.estimators.robust import CAUCHY_TUNING, MAD_TO_SIGMA, TRIMMING_ROUNDS, TUKEY_TUNING, evenly_chosen
@@ -23,7 +23,7 @@ from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.so3 import angles_between, nearest_rotation, skew
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.products import SegmentPiece, TransformEstimate
+from smust3r_colmap.products import Submodel, TransformEstimate
 
 PoseGroup = Literal["sim3", "se3"]
 
@@ -48,16 +48,16 @@ MEDIAN_OF_NORM = 1.5382
 
 
 def align_poses(
-    target: SegmentPiece,
-    source: SegmentPiece,
+    target: Submodel,
+    source: Submodel,
     *,
     depth_target: float,
     kernel: RobustKernel = "cauchy",
     group: PoseGroup = "sim3",
-) -> PieceFit:
+) -> SubmodelFit:
     """Robust ``target_from_source`` from the cameras of the shared images, centres and orientations.
 
-    With T = (s, R, t) and camera k at centre c_k with axes R_k in either piece, minimises
+    With T = (s, R, t) and camera k at centre c_k with axes R_k in either submodel, minimises
 
         sum_k rho(|c_target,k - T c_source,k| / sigma_c) + rho(angle(R_target,k, R R_source,k) / sigma_r).
 
@@ -74,8 +74,8 @@ def align_poses(
     linear at 1.345 sigma here: the paper's fixed delta has no meaning for an angle.
 
     Args:
-        target, source: pieces that share images.
-        depth_target: median depth of the scene in the target piece, in its units.
+        target, source: submodels that share images.
+        depth_target: median depth of the scene in the target submodel, in its units.
         kernel: of both terms.
         group: ``"se3"`` keeps the scale at 1.
 
@@ -93,9 +93,9 @@ def align_poses(
     Hartley, Trumpf, Dai and Li 2013 (median rotation).
     """
     if not (np.isfinite(depth_target) and depth_target > 0):
-        raise ValueError(f"piece {target.name}: median depth {depth_target}, needed a positive number")
+        raise ValueError(f"submodel {target.name}: median depth {depth_target}, needed a positive number")
     pairs = _shared_cameras(target, source, depth_target)
-    between = f"pieces {target.name} and {source.name}"
+    between = f"submodels {target.name} and {source.name}"
     if not len(pairs):
         raise DegenerateAlignmentError(f"{between} share no image, hence no camera")
     if len(pairs) == 1 and group == "sim3":
@@ -144,7 +144,7 @@ class _Cameras:
         return Sim3(scale=scale, rotation=fit.rotation, translation=translation)
 
 
-def _shared_cameras(target: SegmentPiece, source: SegmentPiece, depth: float) -> _Cameras:
+def _shared_cameras(target: Submodel, source: Submodel, depth: float) -> _Cameras:
     _, in_target, in_source = np.intersect1d(target.images, source.images, return_indices=True)
     poses_a, poses_b = source.seg_from_cam[in_source], target.seg_from_cam[in_target]
     mean_a, mean_b = (poses[:, :, 3].sum(axis=0) / max(len(poses), 1) for poses in (poses_a, poses_b))
@@ -175,7 +175,7 @@ class _Terms:
     rotation_weights: FloatArray
 
 
-def _fit(pairs: _Cameras, kernel: RobustKernel, *, fixed_scale: bool) -> PieceFit:
+def _fit(pairs: _Cameras, kernel: RobustKernel, *, fixed_scale: bool) -> SubmodelFit:
     """The estimate and its evidence."""
     fit = _start(pairs, fixed_scale=fixed_scale)
     iterations = 0
@@ -202,7 +202,7 @@ def _fit(pairs: _Cameras, kernel: RobustKernel, *, fixed_scale: bool) -> PieceFi
         stop_reason=stop_reason,
         information=information,
     )
-    return PieceFit(estimate=estimate, num_correspondences=len(pairs), relative_residual=float(np.median(distances)))
+    return SubmodelFit(estimate=estimate, num_correspondences=len(pairs), relative_residual=float(np.median(distances)))
 
 
 def _stages(kernel: RobustKernel) -> tuple[RobustKernel, ...]:

@@ -1,6 +1,6 @@
-"""Aligning two pieces by feature tracks: points that both saw as the same feature of the same image.
+"""Aligning two submodels by feature tracks: points that both saw as the same feature of the same image.
 
-`align_tracks` needs shared images. `match_links` is the bridge between pieces that share none, or
+`align_tracks` needs shared images. `match_links` is the bridge between submodels that share none, or
 too few: a verified two-view match says that a feature here and a feature there are one point.
 The solver is behind ``seen_points``; ``from_pointmaps`` does the same for dense maps.
 """
@@ -10,11 +10,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.alignment.seen_points import PieceFit, align_seen_points
+from smust3r_colmap.alignment.seen_points import SubmodelFit, align_seen_points
 from smust3r_colmap.config import AlignmentConfig
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.geometry.arrays import FloatArray, IntArray
-from smust3r_colmap.products import SegmentPiece, Tracks
+from smust3r_colmap.products import Submodel, Tracks
 
 MAX_VOTES = 5
 """Shared observations of a point pair that count: more of them make the pairing no surer."""
@@ -24,20 +24,20 @@ agreement the start asks for. Links start far off and may be wrong in their majo
 _KEY_SHIFT = np.int64(2**32)
 
 
-def align_tracks(target: SegmentPiece, source: SegmentPiece, settings: AlignmentConfig, *, seed: int = 0) -> PieceFit:
+def align_tracks(target: Submodel, source: Submodel, settings: AlignmentConfig, *, seed: int = 0) -> SubmodelFit:
     """Robust ``target_from_source`` from points that share an (image, feature) observation.
 
     Every pair of points counts once and weighs as many shared observations as it has, up to 5. With
     the redescending kernels residuals are divided by the depth (see ``seen_points``).
 
     Args:
-        target, source: pieces with tracks.
+        target, source: submodels with tracks.
         settings: kernel.
         seed: of the search for a robust start.
 
     Raises:
         DegenerateAlignmentError: too few points are shared, or they do not determine the transform.
-        ValueError: a piece has no tracks, or its tracks name an image that is not of the piece.
+        ValueError: a submodel has no tracks, or its tracks name an image that is not of the submodel.
     """
     on_target, on_source = _tracks(target), _tracks(source)
     _, row_target, row_source = np.intersect1d(_keys(on_target), _keys(on_source), return_indices=True)
@@ -54,8 +54,8 @@ def align_tracks(target: SegmentPiece, source: SegmentPiece, settings: Alignment
 
 
 def match_links(
-    target: SegmentPiece,
-    source: SegmentPiece,
+    target: Submodel,
+    source: Submodel,
     settings: AlignmentConfig,
     *,
     image_a: npt.ArrayLike,
@@ -63,8 +63,8 @@ def match_links(
     image_b: npt.ArrayLike,
     feature_b: npt.ArrayLike,
     seed: int = 0,
-) -> PieceFit:
-    """Robust ``target_from_source`` from two-view matches between images of the two pieces.
+) -> SubmodelFit:
+    """Robust ``target_from_source`` from two-view matches between images of the two submodels.
 
     A match links the target's point behind (image_a, feature_a) to the source's point behind
     (image_b, feature_b); matches with a feature that is part of no point are passed over. With the
@@ -72,14 +72,14 @@ def match_links(
     out; they still count in ``num_correspondences`` and ``relative_residual``.
 
     Args:
-        target, source: pieces with tracks; they need not share an image.
+        target, source: submodels with tracks; they need not share an image.
         settings: kernel.
         image_a, feature_a: (M,) in images of the target. image_b, feature_b: (M,) in images of the source.
         seed: of the search for a robust start.
 
     Raises:
         DegenerateAlignmentError: too few points are linked, or they do not determine the transform.
-        ValueError: the arrays differ in length, or a piece has no or foreign tracks.
+        ValueError: the arrays differ in length, or a submodel has no or external tracks.
     """
     arrays = [np.asarray(values, dtype=np.int64) for values in (image_a, feature_a, image_b, feature_b)]
     if len({values.shape for values in arrays}) != 1 or arrays[0].ndim != 1:
@@ -100,8 +100,8 @@ def match_links(
 
 
 def _align_point_pairs(
-    target: SegmentPiece,
-    source: SegmentPiece,
+    target: Submodel,
+    source: Submodel,
     point_target: IntArray,
     point_source: IntArray,
     settings: AlignmentConfig,
@@ -109,7 +109,7 @@ def _align_point_pairs(
     evidence: str,
     max_start_error: float,
     seed: int,
-) -> PieceFit:
+) -> SubmodelFit:
     """The fit to pairs of points named once for each vote they have."""
     pairs, votes = np.unique(np.column_stack([point_target, point_source]), axis=0, return_counts=True)
     depth_target, depth_source = point_depths(target)[pairs[:, 0]], point_depths(source)[pairs[:, 1]]
@@ -129,24 +129,24 @@ def _align_point_pairs(
             seed=seed,
         )
     except DegenerateAlignmentError as error:
-        raise DegenerateAlignmentError(f"pieces {target.name} and {source.name}, {evidence}: {error}") from error
+        raise DegenerateAlignmentError(f"submodels {target.name} and {source.name}, {evidence}: {error}") from error
 
 
-def point_depths(piece: SegmentPiece) -> FloatArray:
+def point_depths(submodel: Submodel) -> FloatArray:
     """(P,) geometric mean over its observations of each track point's z-depth, in segment units.
 
     Observations with the point behind the camera are passed over; NaN where none is left.
 
     Raises:
-        ValueError: the piece has no tracks, or they name an image that is not of the piece.
+        ValueError: the submodel has no tracks, or they name an image that is not of the submodel.
     """
-    tracks = _tracks(piece)
-    images = np.asarray(piece.images)
+    tracks = _tracks(submodel)
+    images = np.asarray(submodel.images)
     position = np.searchsorted(images, tracks.image_of_observation).clip(max=len(images) - 1)
     if (images[position] != tracks.image_of_observation).any():
-        foreign = sorted(set(tracks.image_of_observation.tolist()) - set(piece.images))
-        raise ValueError(f"piece {piece.name}: tracks name images {foreign[:5]}, which are not of the piece")
-    pose = piece.seg_from_cam[position]
+        external = sorted(set(tracks.image_of_observation.tolist()) - set(submodel.images))
+        raise ValueError(f"submodel {submodel.name}: tracks name images {external[:5]}, which are not of the submodel")
+    pose = submodel.seg_from_cam[position]
     offset = tracks.points_seg[tracks.point_of_observation] - pose[:, :, 3]
     depth = np.einsum("ni,ni->n", pose[:, :, 2], offset)
     front = depth > 0
@@ -159,11 +159,11 @@ def point_depths(piece: SegmentPiece) -> FloatArray:
     return depths
 
 
-def _tracks(piece: SegmentPiece) -> Tracks:
-    """The tracks of a piece that must have them."""
-    if piece.tracks is None:
-        raise ValueError(f"piece {piece.name} has no tracks; align its pointmaps instead")
-    return piece.tracks
+def _tracks(submodel: Submodel) -> Tracks:
+    """The tracks of a submodel that must have them."""
+    if submodel.tracks is None:
+        raise ValueError(f"submodel {submodel.name} has no tracks; align its pointmaps instead")
+    return submodel.tracks
 
 
 def _keys(tracks: Tracks) -> IntArray:

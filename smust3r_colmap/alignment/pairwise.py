@@ -1,8 +1,8 @@
-"""Every edge between the pieces of a run, and the tests that keep broken ones out of the chain.
+"""Every edge between the submodels of a run, and the tests that keep broken ones out of the chain.
 
-Two pieces that share images are joined twice (paper section III-E): by the points that both saw,
+Two submodels that share images are joined twice (paper section III-E): by the points that both saw,
 as feature tracks (as exact as dense pixels at a twentieth of the cost) or else as pointmaps, and by
-the cameras of the shared images. Pieces that share too few images are joined by verified matches
+the cameras of the shared images. Submodels that share too few images are joined by verified matches
 between their images. The next module to read is ``chaining``.
 """
 
@@ -20,7 +20,7 @@ import numpy.typing as npt
 from smust3r_colmap.alignment.from_pointmaps import align_pointmaps
 from smust3r_colmap.alignment.from_poses import align_poses
 from smust3r_colmap.alignment.from_tracks import align_tracks, match_links, point_depths
-from smust3r_colmap.alignment.seen_points import PieceFit
+from smust3r_colmap.alignment.seen_points import SubmodelFit
 from smust3r_colmap.alignment.uncertainty import honest_information, overlap_centre
 from smust3r_colmap.config import AlignmentConfig
 from smust3r_colmap.errors import DegenerateAlignmentError
@@ -33,7 +33,7 @@ from smust3r_colmap.products import (
     Edges,
     FeatureLinks,
     SegmentAlignment,
-    SegmentPiece,
+    Submodel,
     TransformEstimate,
     TriedAlignment,
 )
@@ -54,13 +54,13 @@ MIN_POSE_SHARE = 0.3
 MAX_DISAGREEMENT_SIGMAS = 5.0
 """Between the edge from points and the one from cameras, per degree of freedom."""
 DEPTH_IMAGES = 8
-"""Maps looked at for the median depth of a piece."""
+"""Maps looked at for the median depth of a submodel."""
 MAX_CAMERA_TURN_DEG = 10.0
 """Median difference in rotation of the shared cameras after the fit; sound edges have 0.1 to 1.8."""
 
 
-def align_pieces(
-    pieces: Sequence[SegmentPiece],
+def align_submodels(
+    submodels: Sequence[Submodel],
     dense: Sequence[DenseMaps],
     links: FeatureLinks | None,
     settings: AlignmentConfig,
@@ -69,23 +69,23 @@ def align_pieces(
     seed: int,
     advance: Callable[[int], None],
 ) -> Edges:
-    """Align every pair of pieces that could have something in common.
+    """Align every pair of submodels that could have something in common.
 
     A pair gives up to two edges (paper section III-E): one from the points that both see, one from
     the cameras of the images that both hold. Where both are sound but deny each other, the one from
     points stays, since it rests on more.
 
     Args:
-        pieces: all of the run. dense: their maps, in the same order.
-        links: verified matches, for pieces that share too few images; None where there are none.
+        submodels: all of the run. dense: their maps, in the same order.
+        links: verified matches, for submodels that share too few images; None where there are none.
         settings: group, kinds of edges, source of correspondences, kernel, weighting.
         loop_segments: indices of the segments that are loops, not windows of the sequence.
         seed: of the searches for a robust start.
         advance: called with 1 after each pair of ``candidate_pairs``.
     """
-    aligner = _Aligner(pieces=pieces, dense=dense, links=links, settings=settings, seed=seed)
+    aligner = _Aligner(submodels=submodels, dense=dense, links=links, settings=settings, seed=seed)
     outcomes: list[SegmentAlignment | TriedAlignment] = []
-    for target, source in candidate_pairs(pieces, loop_segments):
+    for target, source in candidate_pairs(submodels, loop_segments):
         outcomes += aligner.align(target, source)
         advance(1)
     return Edges(
@@ -94,32 +94,32 @@ def align_pieces(
     )
 
 
-def needs_maps(pieces: Sequence[SegmentPiece], settings: AlignmentConfig) -> bool:
+def needs_maps(submodels: Sequence[Submodel], settings: AlignmentConfig) -> bool:
     """Whether any pair may be aligned by its pointmaps."""
     return settings.alignment_source == "pointmaps" or (
-        settings.alignment_source == "auto" and any(piece.tracks is None for piece in pieces)
+        settings.alignment_source == "auto" and any(submodel.tracks is None for submodel in submodels)
     )
 
 
-def candidate_pairs(pieces: Sequence[SegmentPiece], loop_segments: Collection[int] = ()) -> tuple[tuple[int, int], ...]:
+def candidate_pairs(submodels: Sequence[Submodel], loop_segments: Collection[int] = ()) -> tuple[tuple[int, int], ...]:
     """Pairs that share an image, or belong to the same or to neighbouring windows; never two loops."""
-    images = [set(piece.images) for piece in pieces]
-    is_loop = [piece.segment in loop_segments for piece in pieces]
+    images = [set(submodel.images) for submodel in submodels]
+    is_loop = [submodel.segment in loop_segments for submodel in submodels]
 
     def worth_it(a: int, b: int) -> bool:
         if is_loop[a] and is_loop[b]:
             return False
-        neighbours = not (is_loop[a] or is_loop[b]) and abs(pieces[a].segment - pieces[b].segment) <= 1
+        neighbours = not (is_loop[a] or is_loop[b]) and abs(submodels[a].segment - submodels[b].segment) <= 1
         return neighbours or not images[a].isdisjoint(images[b])
 
-    return tuple((a, b) for a, b in combinations(range(len(pieces)), 2) if worth_it(a, b))
+    return tuple((a, b) for a, b in combinations(range(len(submodels)), 2) if worth_it(a, b))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Aligner:
-    """All that aligning a pair of pieces needs."""
+    """All that aligning a pair of submodels needs."""
 
-    pieces: Sequence[SegmentPiece]
+    submodels: Sequence[Submodel]
     dense: Sequence[DenseMaps]
     links: FeatureLinks | None
     settings: AlignmentConfig
@@ -127,9 +127,9 @@ class _Aligner:
     _depths: dict[int, float] = field(default_factory=dict)
 
     def align(self, target: int, source: int) -> list[SegmentAlignment | TriedAlignment]:
-        """Every edge between two pieces that was tried."""
+        """Every edge between two submodels that was tried."""
         outcomes: list[SegmentAlignment | TriedAlignment] = []
-        shared = bool(set(self.pieces[target].images) & set(self.pieces[source].images))
+        shared = bool(set(self.submodels[target].images) & set(self.submodels[source].images))
         if self.settings.alignment_edges != "poses":
             if shared:
                 outcomes.append(self._by_points(target, source))
@@ -140,7 +140,7 @@ class _Aligner:
         return outcomes
 
     def _by_points(self, target: int, source: int) -> SegmentAlignment | TriedAlignment:
-        a, b = self.pieces[target], self.pieces[source]
+        a, b = self.submodels[target], self.submodels[source]
         evidence = _evidence(a, b, self.settings)
         try:
             if evidence == "tracks":
@@ -152,12 +152,12 @@ class _Aligner:
             return TriedAlignment(target=target, source=source, evidence=evidence, reason=str(error))
 
     def _has_links(self, target: int, source: int) -> bool:
-        tracks = (self.pieces[target].tracks, self.pieces[source].tracks)
+        tracks = (self.submodels[target].tracks, self.submodels[source].tracks)
         return self.links is not None and None not in tracks
 
     def _by_links(self, target: int, source: int) -> SegmentAlignment | TriedAlignment:
         assert self.links is not None
-        a, b = self.pieces[target], self.pieces[source]
+        a, b = self.submodels[target], self.submodels[source]
         try:
             fit = _align_by_links(a, b, self.links, self.settings, self.seed)
         except DegenerateAlignmentError as error:
@@ -167,7 +167,7 @@ class _Aligner:
     def _by_poses(
         self, target: int, source: int, *, beside: Sequence[SegmentAlignment | TriedAlignment]
     ) -> SegmentAlignment | TriedAlignment:
-        a, b = self.pieces[target], self.pieces[source]
+        a, b = self.submodels[target], self.submodels[source]
         group: Literal["sim3", "se3"] = "se3" if self.settings.transform_group == "se3" else "sim3"
         try:
             fit = align_poses(a, b, depth_target=self._depth(target), kernel=self.settings.robust_kernel, group=group)
@@ -176,10 +176,10 @@ class _Aligner:
             return TriedAlignment(target=target, source=source, evidence="poses", reason=str(error))
         return replace(edge, accepted=False, reason=reason) if (reason := _denied_by(edge, beside)) else edge
 
-    def _edge(self, target: int, source: int, fit: PieceFit, evidence: str, reason: str) -> SegmentAlignment:
+    def _edge(self, target: int, source: int, fit: SubmodelFit, evidence: str, reason: str) -> SegmentAlignment:
         """The fit with the uncertainty that a graph may believe, in the group of the run."""
-        b = self.pieces[source]
-        shared = set(self.pieces[target].images) & set(b.images)
+        b = self.submodels[source]
+        shared = set(self.submodels[target].images) & set(b.images)
         group = GROUPS[self.settings.transform_group]
         information = honest_information(
             fit.estimate,
@@ -201,10 +201,10 @@ class _Aligner:
         )
 
     def _depth(self, position: int) -> float:
-        """Median depth of a piece, measured once."""
+        """Median depth of a submodel, measured once."""
         if position not in self._depths:
-            piece = self.pieces[position]
-            self._depths[position] = median_depth(piece, self.dense[position] if piece.tracks is None else None)
+            submodel = self.submodels[position]
+            self._depths[position] = median_depth(submodel, self.dense[position] if submodel.tracks is None else None)
         return self._depths[position]
 
 
@@ -221,22 +221,22 @@ def _in_group(estimate: TransformEstimate, group: type[Transform]) -> TransformE
     )
 
 
-def median_depth(piece: SegmentPiece, maps: DenseMaps | None) -> float:
-    """Median depth of what a piece sees, in its units: of its track points, else of some of its maps.
+def median_depth(submodel: Submodel, maps: DenseMaps | None) -> float:
+    """Median depth of what a submodel sees, in its units: of its track points, else of some of its maps.
 
     Raises:
         DegenerateAlignmentError: there is no depth at all.
     """
-    if piece.tracks is not None:
-        depths = point_depths(piece)
+    if submodel.tracks is not None:
+        depths = point_depths(submodel)
     elif maps is None:
-        raise ValueError(f"piece {piece.name} has neither tracks nor maps")
+        raise ValueError(f"submodel {submodel.name} has neither tracks nor maps")
     else:
-        some = evenly_chosen(len(piece.images), DEPTH_IMAGES)
+        some = evenly_chosen(len(submodel.images), DEPTH_IMAGES)
         depths = np.concatenate([maps.depth(int(k))[::4, ::4].ravel() for k in some]).astype(np.float64)
     known = depths[np.isfinite(depths) & (depths > 0)]
     if not len(known):
-        raise DegenerateAlignmentError(f"piece {piece.name} has no depth anywhere")
+        raise DegenerateAlignmentError(f"submodel {submodel.name} has no depth anywhere")
     return float(np.median(known))
 
 
@@ -244,15 +244,13 @@ def _is_accepted(outcome: SegmentAlignment | TriedAlignment) -> bool:
     return isinstance(outcome, SegmentAlignment) and outcome.accepted
 
 
-def _evidence(a: SegmentPiece, b: SegmentPiece, settings: AlignmentConfig) -> str:
+def _evidence(a: Submodel, b: Submodel, settings: AlignmentConfig) -> str:
     if settings.alignment_source != "auto":
         return settings.alignment_source
     return "tracks" if a.tracks is not None and b.tracks is not None else "pointmaps"
 
 
-def _align_by_links(
-    a: SegmentPiece, b: SegmentPiece, links: FeatureLinks, settings: AlignmentConfig, seed: int
-) -> PieceFit:
+def _align_by_links(a: Submodel, b: Submodel, links: FeatureLinks, settings: AlignmentConfig, seed: int) -> SubmodelFit:
     """Matches run from the lower to the higher image; take them both ways."""
     in_a, in_b = np.array(a.images), np.array(b.images)
     forward = np.isin(links.image_a, in_a) & np.isin(links.image_b, in_b)
@@ -273,7 +271,7 @@ def _align_by_links(
     )
 
 
-def _refusal(a: SegmentPiece, b: SegmentPiece, fit: PieceFit) -> str:
+def _refusal(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
     """Why an edge from shared images cannot be believed, or nothing."""
     if not fit.relative_residual <= MAX_RELATIVE_RESIDUAL:
         return f"median residual is {fit.relative_residual:.3f} of the depth, at most {MAX_RELATIVE_RESIDUAL}"
@@ -282,7 +280,7 @@ def _refusal(a: SegmentPiece, b: SegmentPiece, fit: PieceFit) -> str:
     return _camera_refusal(a, b, fit)
 
 
-def _camera_refusal(a: SegmentPiece, b: SegmentPiece, fit: PieceFit) -> str:
+def _camera_refusal(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
     if not set(a.images) & set(b.images):
         return ""
     turn_deg = camera_turn_deg(a, b, fit)
@@ -291,7 +289,7 @@ def _camera_refusal(a: SegmentPiece, b: SegmentPiece, fit: PieceFit) -> str:
     return ""
 
 
-def _refusal_of_links(a: SegmentPiece, b: SegmentPiece, fit: PieceFit) -> str:
+def _refusal_of_links(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
     """The same for an edge from matches; cameras that are shared all the same have to agree."""
     if fit.estimate.num_inliers < MIN_LINK_INLIERS:
         return f"{fit.estimate.num_inliers} matched points fit, needed {MIN_LINK_INLIERS}"
@@ -300,7 +298,7 @@ def _refusal_of_links(a: SegmentPiece, b: SegmentPiece, fit: PieceFit) -> str:
     return _camera_refusal(a, b, fit)
 
 
-def _refusal_of_poses(a: SegmentPiece, b: SegmentPiece, fit: PieceFit) -> str:
+def _refusal_of_poses(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
     """The same for an edge from cameras."""
     if not fit.relative_residual <= MAX_RELATIVE_RESIDUAL:
         return f"the centres differ by {fit.relative_residual:.3f} of the depth, at most {MAX_RELATIVE_RESIDUAL}"
@@ -324,7 +322,7 @@ def _denied_by(edge: SegmentAlignment, beside: Sequence[SegmentAlignment | Tried
 
 
 def disagreement_sigmas(first: SegmentAlignment, second: SegmentAlignment) -> float:
-    """How far apart two edges between the same pieces are, per degree of freedom, in standard deviations.
+    """How far apart two edges between the same submodels are, per degree of freedom, in standard deviations.
 
     Infinite where the difference is a stretched half turn, which has no logarithm.
     """
@@ -337,7 +335,7 @@ def disagreement_sigmas(first: SegmentAlignment, second: SegmentAlignment) -> fl
     return float(np.sqrt(difference @ both @ difference / len(difference)))
 
 
-def camera_turn_deg(a: SegmentPiece, b: SegmentPiece, fit: PieceFit) -> float:
+def camera_turn_deg(a: Submodel, b: Submodel, fit: SubmodelFit) -> float:
     """Median angle in degrees between the cameras of the shared images after the fit."""
     shared = sorted(set(a.images) & set(b.images))
     poses_a = a.seg_from_cam[[a.images.index(image) for image in shared]]

@@ -1,6 +1,6 @@
 """Aligning points that cameras saw, in the group that was asked for (paper sections III-C and III-D).
 
-Here the pieces of the solver come together: the residual over the depth, the consensus to start
+Here the submodels of the solver come together: the residual over the depth, the consensus to start
 from, the estimator of the group, and the tests that send an overlap which does not determine an
 affine or projective transform back to Sim(3). ``from_tracks`` and ``from_pointmaps`` call it.
 """
@@ -118,7 +118,7 @@ def align_seen_points(
     group: TransformGroup = "sim3",
     max_start_error: float = np.inf,
     seed: int = 0,
-) -> PieceFit:
+) -> SubmodelFit:
     """Robust ``target_from_source`` of points that cameras saw at known depths.
 
     ``cauchy`` and ``tukey`` divide the residual by the depth, since the error of a point grows with
@@ -128,7 +128,7 @@ def align_seen_points(
     paper: plain residuals, plain start.
 
     ``affine3`` and ``sl4`` fall back to Sim(3), with a warning, where the points lie too close to a
-    plane for their noise or the fit is absurd; ``PieceFit.fallback`` says which and by how much.
+    plane for their noise or the fit is absurd; ``SubmodelFit.fallback`` says which and by how much.
 
     Args:
         points_source, points_target: (N, 3); equal rows are the same scene point.
@@ -168,7 +168,7 @@ def align_seen_points(
     )
     estimate, fallback = _estimate_or_fall_back(seen, group, start)
     relative = point_distances(estimate.b_from_a, *points) / depth
-    return PieceFit(
+    return SubmodelFit(
         estimate=estimate,
         num_correspondences=len(weights),
         relative_residual=float(np.median(relative)),
@@ -237,8 +237,8 @@ def absurdity(b_from_a: Transform, points_a: FloatArray) -> str:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PieceFit:
-    """``target_from_source`` between two pieces, with what tells a sound fit from a broken one.
+class SubmodelFit:
+    """``target_from_source`` between two submodels, with what tells a sound fit from a broken one.
 
     Args:
         estimate: the transform and the evidence of the solver.

@@ -2,11 +2,11 @@
 
 A solver that takes its rows as independent is sure of itself beyond reason: ten thousand pixels of
 thirty images are one reconstruction's opinion, and a reconstruction bends. What the edge stands for
-in the graph is where the two *whole* pieces lie, not where they agree on the images they share.
+in the graph is where the two *whole* submodels lie, not where they agree on the images they share.
 The information of a solver is therefore cut down to few observations per image, and what no number
 of observations removes is added. The next module to read is ``edges``.
 
-Measured on 25 pairs of pieces with true cameras, every piece fitted to the truth by itself, which gives
+Measured on 25 pairs of submodels with true cameras, every submodel fitted to the truth by itself, which gives
 the true relation of a pair. Median error at the middle of the overlap (as degrees, percent of scale,
 percent of the depth), and its squared length in standard deviations over 7, which should be near 1:
 
@@ -20,7 +20,7 @@ percent of the depth), and its squared length in standard deviations over 7, whi
     =============  ==================  =================  ===================  ===============
 
 The two edges of one pair agree ten times better with each other than with the truth (median over the
-sets 0.03 to 0.2 degrees, 0.01 to 0.7 %, 0.01 to 0.6 %): they share the bend of the pieces. So they are
+sets 0.03 to 0.2 degrees, 0.01 to 0.7 %, 0.01 to 0.6 %): they share the bend of the submodels. So they are
 no two witnesses: the pose graph (``stitching``) divides what they say by their number.
 """
 
@@ -30,7 +30,7 @@ import numpy as np
 
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.products import SegmentPiece, TransformEstimate
+from smust3r_colmap.products import Submodel, TransformEstimate
 
 OBSERVATIONS_PER_IMAGE = 0.1
 """Independent observations that a shared image is worth, be it as 300 pixels or as one camera."""
@@ -39,7 +39,7 @@ FLOOR = 0.005
 middle of the overlap: radians, log scale, shear, and parts of the depth for a shift."""
 UNKNOWN = 0.05
 """Standard deviation of a direction that the group of the estimate does not have (such as the shear
-between two pieces of which a similarity is known): pieces of one backbone do not differ by more."""
+between two submodels of which a similarity is known): submodels of one backbone do not differ by more."""
 
 
 def honest_information(
@@ -55,12 +55,12 @@ def honest_information(
     The solver's information is scaled to ``OBSERVATIONS_PER_IMAGE`` rows per shared image, and
     ``FLOOR`` is added to its covariance. Both happen in a frame with its origin in the middle of the
     overlap: there rotation, scale and shift are errors of different kinds, while at the origin of the
-    piece, which may be far, a rotation is mostly a shift. The adjoint carries the result back.
+    submodel, which may be far, a rotation is mostly a shift. The adjoint carries the result back.
 
     Args:
         estimate: ``target_from_source``, with the information of the right perturbation that takes its
             ``num_points`` rows as independent; it may be singular.
-        num_images: shared by the two pieces.
+        num_images: shared by the two submodels.
         centre_source: (3,) middle of the overlap in the source frame, such as ``overlap_centre``.
         depth_source: median depth of the scene there, in units of the source.
         group: of the pose graph, where the estimate's own is a smaller one; directions that the
@@ -98,20 +98,20 @@ def honest_information(
     return information
 
 
-def overlap_centre(source: SegmentPiece, shared: set[int], depth_source: float) -> FloatArray:
+def overlap_centre(source: Submodel, shared: set[int], depth_source: float) -> FloatArray:
     """(3,) median place at the usual depth before the cameras of the shared images.
 
     Args:
-        source: the piece in whose frame the place is wanted.
+        source: the submodel in whose frame the place is wanted.
         shared: indices into the collection.
         depth_source: median depth of its scene.
 
     Raises:
-        ValueError: the piece holds none of the images.
+        ValueError: the submodel holds none of the images.
     """
     poses = source.seg_from_cam[[image in shared for image in source.images]]
     if not len(poses):
-        raise ValueError(f"piece {source.name} holds none of the {len(shared)} shared images")
+        raise ValueError(f"submodel {source.name} holds none of the {len(shared)} shared images")
     centre: FloatArray = np.median(poses[:, :, 3] + depth_source * poses[:, :, 2], axis=0)
     return centre
 

@@ -1,7 +1,7 @@
 """What every backbone is to the pipeline, and what the pipeline gives it.
 
 ``registry`` finds backbones by name. Those that are networks start from ``feed_forward``, which keeps their
-predictions on disk and turns them into pieces.
+predictions on disk and turns them into submodels.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from smust3r_colmap.products import (
     RejectedImage,
     RunFeatures,
     Segment,
-    SegmentPiece,
     SegmentReconstruction,
+    Submodel,
 )
 from smust3r_colmap.storage.run_directory import RunDirectory
 
@@ -34,7 +34,7 @@ class BackboneResult:
 
     Args:
         reconstructions: one per segment, in order.
-        dense: maps of every piece, in the order in which ``pieces`` lists them.
+        dense: maps of every submodel, in the order in which ``submodels`` lists them.
         dense_key: hash of all that the maps were made from.
         links: verified matches, where the backbone has features.
         rejected: images that the backbone could not use at all.
@@ -49,13 +49,13 @@ class BackboneResult:
     features: RunFeatures | None = None
 
     def __post_init__(self) -> None:
-        if len(self.dense) != len(self.pieces):
-            raise ValueError(f"{len(self.dense)} sets of maps for {len(self.pieces)} pieces")
+        if len(self.dense) != len(self.submodels):
+            raise ValueError(f"{len(self.dense)} sets of maps for {len(self.submodels)} submodels")
 
     @property
-    def pieces(self) -> tuple[SegmentPiece, ...]:
-        """Every piece of every segment: the nodes of the pose graph."""
-        return tuple(piece for reconstruction in self.reconstructions for piece in reconstruction.pieces)
+    def submodels(self) -> tuple[Submodel, ...]:
+        """Every submodel of every segment: the nodes of the pose graph."""
+        return tuple(submodel for reconstruction in self.reconstructions for submodel in reconstruction.submodels)
 
 
 class Backbone(Protocol):
@@ -64,7 +64,7 @@ class Backbone(Protocol):
     name: str
     metric: bool
     has_tracks: bool
-    """Pieces come with feature tracks, so that they can be aligned without maps."""
+    """Submodels come with feature tracks, so that they can be aligned without maps."""
 
     def describe(self) -> npt.NDArray[np.float32]:
         """(N, D) one vector of unit length per image of the collection; zero where an image gave none.

@@ -1,7 +1,7 @@
 """From a network that looks at many images at once to a backbone.
 
 A feed-forward network needs two things from us: somebody who keeps its predictions, so that a run can go
-on, and somebody who turns them into pieces. It gives them as a ``Predictor``; ``FeedForwardBackbone``
+on, and somebody who turns them into submodels. It gives them as a ``Predictor``; ``FeedForwardBackbone``
 does the rest. docs/backbones.md shows a whole one.
 """
 
@@ -26,8 +26,8 @@ from smust3r_colmap.products import (
     DenseMaps,
     ImageCollection,
     Segment,
-    SegmentPiece,
     SegmentReconstruction,
+    Submodel,
     UnregisteredImage,
 )
 from smust3r_colmap.storage.dense_maps import ImageMaps, StoredMaps, write_maps
@@ -42,7 +42,7 @@ from smust3r_colmap.storage.run_directory import (
 )
 
 MIN_IMAGES = 2
-"""Of a piece; one image has no baseline and ties nothing."""
+"""Of a submodel; one image has no baseline and ties nothing."""
 MAX_CONFIDENCE = 6e4
 """What a half float holds."""
 _ROTATION_TOLERANCE = 1e-3
@@ -76,14 +76,14 @@ class SegmentPrediction:
         unregistered: the others, and why.
         method: how it was made, in words for people.
         notes: what is worth knowing about the making, such as a retry with less memory.
-        doubts: why the geometry should not be trusted; the run ends as weak.
+        warnings: why the geometry should not be trusted; the run ends as weak.
     """
 
     images: Sequence[PredictedImage]
     unregistered: tuple[UnregisteredImage, ...] = ()
     method: str
     notes: tuple[str, ...] = ()
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def fingerprint_of(weights: Path) -> str:
@@ -173,7 +173,7 @@ class FeedForwardBackbone:
         read = [_read(segment, folder, metric=self.metric) for segment, folder in zip(segments, folders, strict=True)]
         return BackboneResult(
             reconstructions=tuple(reconstruction for reconstruction, _ in read),
-            dense=tuple(maps for _, of_piece in read for maps in of_piece),
+            dense=tuple(maps for _, of_submodel in read for maps in of_submodel),
             dense_key=key_of([folder.key for folder in folders]),
             links=None,
             rejected=(),
@@ -253,7 +253,7 @@ def _checked(prediction: SegmentPrediction, segment: Segment) -> SegmentPredicti
         unregistered=tuple(lost),
         method=prediction.method,
         notes=prediction.notes,
-        doubts=prediction.doubts if kept else (),
+        warnings=prediction.warnings if kept else (),
     )
 
 
@@ -277,7 +277,7 @@ def _write(folder: Path, prediction: SegmentPrediction) -> None:
         "unregistered": [asdict(one) for one in prediction.unregistered],
         "method": prediction.method,
         "notes": prediction.notes,
-        "doubts": prediction.doubts,
+        "warnings": prediction.warnings,
     }
     poses = np.array([one.seg_from_cam for one in prediction.images], np.float64).reshape(-1, 3, 4)
     write_json(folder / "segment.json", facts)
@@ -299,11 +299,11 @@ def _read(
     segment: Segment, folder: StageFolder, *, metric: bool
 ) -> tuple[SegmentReconstruction, tuple[DenseMaps, ...]]:
     facts = read_json(folder.path / "segment.json")
-    pieces: tuple[SegmentPiece, ...] = ()
+    submodels: tuple[Submodel, ...] = ()
     if facts["images"]:
-        piece = SegmentPiece(
+        submodel = Submodel(
             segment=segment.index,
-            piece=0,
+            submodel=0,
             images=tuple(facts["images"]),
             seg_from_cam=read_arrays(folder.path / "poses.safetensors")["seg_from_cam"],
             intrinsics=tuple(Intrinsics(**one) for one in facts["intrinsics"]),
@@ -311,15 +311,15 @@ def _read(
             reprojection_error_px=float("nan"),
             tracks=None,
         )
-        pieces = (piece,)
+        submodels = (submodel,)
     unregistered = tuple(UnregisteredImage(**one) for one in facts["unregistered"])
-    reasons = Counter(one.reason for one in unregistered).most_common(1 if not pieces else 0)
+    reasons = Counter(one.reason for one in unregistered).most_common(1 if not submodels else 0)
     reconstruction = SegmentReconstruction(
         segment=segment.index,
-        pieces=pieces,
+        submodels=submodels,
         unregistered=unregistered,
         attempts=(facts["method"], *(f"{count} images: {reason}" for reason, count in reasons), *facts["notes"]),
         metric=metric,
-        doubts=tuple(facts["doubts"]),
+        warnings=tuple(facts["warnings"]),
     )
-    return reconstruction, tuple(StoredMaps(folder.path, piece) for piece in pieces)
+    return reconstruction, tuple(StoredMaps(folder.path, submodel) for submodel in submodels)

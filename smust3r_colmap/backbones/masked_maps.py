@@ -29,8 +29,8 @@ def without_masked_depth(result: BackboneResult, collection: ImageCollection) ->
     if not collection.mask_digests:
         return result
     dense = tuple(
-        MaskedMaps(maps=maps, images=tuple(collection.images[index] for index in piece.images))
-        for maps, piece in zip(result.dense, result.pieces, strict=True)
+        MaskedMaps(maps=maps, images=tuple(collection.images[index] for index in submodel.images))
+        for maps, submodel in zip(result.dense, result.submodels, strict=True)
     )
     return replace(result, dense=dense, dense_key=key_of("masked", result.dense_key, collection.mask_digests))
 
@@ -40,8 +40,8 @@ class MaskedMaps:
     """``DenseMaps`` with neither depth nor confidence on masked pixels; a pixel of a map is as its centre in the mask.
 
     Args:
-        maps: of one piece.
-        images: of the piece, in the order of the maps.
+        maps: of one submodel.
+        images: of the submodel, in the order of the maps.
     """
 
     maps: DenseMaps

@@ -214,7 +214,7 @@ class VggtPredictor:
         """
         shown, unregistered = self._show(segment.images)
         images: list[PredictedImage] = []
-        doubts: tuple[str, ...] = ()
+        warnings: tuple[str, ...] = ()
         if shown:
             pixels = network_input(shown)
             answer = self._asked(pixels, segment)
@@ -224,13 +224,13 @@ class VggtPredictor:
                     images.append(self._predicted(one, answer, k, first_row=rows[k]))
                 else:
                     unregistered.append(UnregisteredImage(image=one.image, reason="its predicted camera is not finite"))
-            doubts = _doubts(answer, shown, rows)
+            warnings = _doubts(answer, shown, rows)
         stage.advance(len(segment.images))
         return SegmentPrediction(
             images=images,
             unregistered=tuple(unregistered),
             method=f"VGGT at {self.width} px, {len(shown)} images at once",
-            doubts=doubts,
+            warnings=warnings,
         )
 
     def _show(self, images: Sequence[int]) -> tuple[list[_Shown], list[UnregisteredImage]]:

@@ -84,7 +84,7 @@ class Check:
         works: it can be imported.
         needed: the program cannot do its work without it.
         devices: accelerators that it can use.
-        remarks: what else is worth knowing, such as whether a network has its weights.
+        notes: what else is worth knowing, such as whether a network has its weights.
         advice: why it does not work and what to do; empty when it works.
     """
 
@@ -94,7 +94,7 @@ class Check:
     works: bool
     needed: bool
     devices: tuple[str, ...]
-    remarks: tuple[str, ...]
+    notes: tuple[str, ...]
     advice: str
 
 
@@ -170,7 +170,7 @@ def _check_package(distribution: str, program: str) -> Check:
         works=not advice,
         needed=distribution not in _NOT_NEEDED,
         devices=devices,
-        remarks=(),
+        notes=(),
         advice=advice,
     )
 
@@ -178,7 +178,7 @@ def _check_package(distribution: str, program: str) -> Check:
 def _check_backbone(known: KnownBackbone) -> Check:
     is_ours = known.package == OUR_PACKAGE
     program = _IMPORT_BACKBONE.format(name=known.name) + (_MORE_OF_BACKBONE.get(known.name, "") if is_ours else "")
-    remarks, advice = _run_child(program)
+    notes, advice = _run_child(program)
     return Check(
         kind="backbone",
         name=known.name if is_ours else f"{known.name} (of {known.package})",
@@ -186,14 +186,14 @@ def _check_backbone(known: KnownBackbone) -> Check:
         works=not advice,
         needed=is_ours and known.name == _NEEDED_BACKBONE,
         devices=(),
-        remarks=remarks,
+        notes=notes,
         advice=advice,
     )
 
 
 def _check_part(kind: str, name: str, module: str) -> Check:
     _, advice = _run_child(f"import {module}")
-    return Check(kind=kind, name=name, version="", works=not advice, needed=True, devices=(), remarks=(), advice=advice)
+    return Check(kind=kind, name=name, version="", works=not advice, needed=True, devices=(), notes=(), advice=advice)
 
 
 def _run_child(program: str) -> tuple[tuple[str, ...], str]:
@@ -229,4 +229,4 @@ def _check_line(check: Check) -> str:
     state = "works" if check.works else ("BROKEN" if check.needed else "not usable, not needed")
     advice = f": {check.advice}" if check.advice else ""
     line = f"  {check.kind:8}  {f'{check.name} {check.version}'.strip():32}  {state}{advice}"
-    return "\n".join([line, *(f"{'':12}{remark}" for remark in check.remarks)])
+    return "\n".join([line, *(f"{'':12}{note}" for note in check.notes)])

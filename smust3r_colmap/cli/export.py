@@ -95,8 +95,8 @@ def run_export(command: Export, reporter: Reporter) -> int:
                 stage.advance()
             if not command.quiet:
                 print(finished.output / written.name)
-                for remark in written.remarks:
-                    print(f"  {remark}")
+                for note in written.notes:
+                    print(f"  {note}")
     return _EXIT_GOOD
 
 

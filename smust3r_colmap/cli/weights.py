@@ -163,12 +163,12 @@ def _fetch(action: FetchWeights, reporter: Reporter) -> int:
         raise ConfigError(f"--base-url {action.base_url}: must begin with http:// or https:// and be plain ASCII")
     target = published_place(file)
     if target.is_file():
-        verdict = verify(target)
-        if verdict.sound:
-            reporter.note(verdict.text)
+        decision = verify(target)
+        if decision.sound:
+            reporter.note(decision.text)
             print(target)
             return _EXIT_GOOD
-        reporter.warn(verdict.text)
+        reporter.warn(decision.text)
     print(f"{LICENCE_SUMMARY}\n", file=sys.stderr)
     if not action.accept_licence and not _consents(file):
         print("smust3r-colmap: the licence was not accepted; nothing was fetched", file=sys.stderr)
@@ -205,10 +205,10 @@ def _verify(action: VerifyWeights) -> int:
         paths = [published_place(official(action.file))]
         if not paths[0].is_file():
             return _fail(f"{paths[0]}: is not there; {fetch_advice(official(action.file))}")
-    verdicts = [verify(path) for path in paths]
-    for verdict in verdicts:
-        print(verdict.text)
-    return _EXIT_GOOD if all(verdict.sound for verdict in verdicts) else _EXIT_FAILED
+    decisions = [verify(path) for path in paths]
+    for decision in decisions:
+        print(decision.text)
+    return _EXIT_GOOD if all(decision.sound for decision in decisions) else _EXIT_FAILED
 
 
 def _convert(action: ConvertWeights, reporter: Reporter) -> int:

@@ -1,8 +1,8 @@
-"""From placed pieces to one scene: every image one pose, every camera one calibration, one cloud.
+"""From placed submodels to one scene: every image one pose, every camera one calibration, one cloud.
 
-Pieces overlap, so most images were reconstructed twice. Their poses are averaged, calibrations are
+Submodels overlap, so most images were reconstructed twice. Their poses are averaged, calibrations are
 voted on, and of the dense maps one per image is used, hung on the averaged pose so that cloud and
-cameras agree. Pieces of loop segments only speak for images that no window piece holds: they are made
+cameras agree. Submodels of loop segments only speak for images that no window submodel holds: they are made
 of two short runs of the sequence, and their work is done in the graph.
 All of it takes values and returns values; maps are read one image at a time.
 The next modules to read are the exporters.
@@ -20,7 +20,7 @@ from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import DenseMaps, PointCloud
 from smust3r_colmap.stitching.camera_fusion import FusedCameras, points_in_camera
-from smust3r_colmap.stitching.resection import PlacedPiece
+from smust3r_colmap.stitching.resection import PlacedSubmodel
 
 SAMPLES_PER_POINT = 4
 """Pixels gathered per fused point: enough for every voxel to be an average, few enough for memory."""
@@ -111,7 +111,7 @@ class _MapSamples:
 
 
 def fuse_points(
-    pieces: Sequence[PlacedPiece],
+    submodels: Sequence[PlacedSubmodel],
     dense: Sequence[DenseMaps],
     cameras: FusedCameras,
     *,
@@ -121,10 +121,10 @@ def fuse_points(
 ) -> FusedPoints:
     """The confident pixels of all maps as one cloud, averaged over the cells of a regular grid.
 
-    Each image gives its map once, from ``cameras.best_piece``. The pointmap goes into the world by the
-    piece's transform, into the camera by the pose that the piece itself placed there, and back into
+    Each image gives its map once, from ``cameras.best_submodel``. The pointmap goes into the world by the
+    submodel's transform, into the camera by the pose that the submodel itself placed there, and back into
     the world by the *fused* pose. For maps that are depth unprojected, under a similarity, this is depth
-    times scale along the rays of the piece's own intrinsics (those made the depth, the fused ones did
+    times scale along the rays of the submodel's own intrinsics (those made the depth, the fused ones did
     not); maps that carry more than depth keep it, and a transform that bends them bends the cloud.
 
     Cells start at the usual distance of neighbouring pixels and grow until ``max_points`` suffice.
@@ -135,24 +135,24 @@ def fuse_points(
     Memory: about 100 bytes x ``SAMPLES_PER_POINT`` x ``max_points``, and one image's maps.
 
     Args:
-        pieces, dense: one each, of one connected part.
-        cameras: ``fuse_cameras`` of the same pieces.
+        submodels, dense: one each, of one connected part.
+        cameras: ``fuse_cameras`` of the same submodels.
         max_points: upper bound of the cloud, at least 1.
         min_confidence: pixels below are left out.
         depth_scale: (N,) what each image's map is multiplied with, where the cameras were adjusted since; 1 if
             not given.
 
     Raises:
-        ValueError: numbers of pieces and maps differ, or ``max_points`` is below 1.
+        ValueError: numbers of submodels and maps differ, or ``max_points`` is below 1.
     """
-    if len(pieces) != len(dense):
-        raise ValueError(f"fusion: {len(pieces)} pieces and {len(dense)} sets of maps; needed one each")
+    if len(submodels) != len(dense):
+        raise ValueError(f"fusion: {len(submodels)} submodels and {len(dense)} sets of maps; needed one each")
     if max_points < 1:
         raise ValueError(f"max_points is {max_points}, needed at least 1")
     quota = -(-SAMPLES_PER_POINT * max_points // len(cameras.images))
     origin = np.median(invert_rigid(cameras.cam_from_world)[:, :, 3], axis=0)
     samples, spacing, num_pixels = _gathered(
-        pieces,
+        submodels,
         dense,
         cameras,
         np.ones(len(cameras.images)) if depth_scale is None else depth_scale,
@@ -224,9 +224,9 @@ def _finite(vectors: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def _sampled(
-    placed: PlacedPiece, maps: DenseMaps, k: int, depth_scale: float, *, min_confidence: float, quota: int
+    placed: PlacedSubmodel, maps: DenseMaps, k: int, depth_scale: float, *, min_confidence: float, quota: int
 ) -> _MapSamples:
-    """At most ``quota`` confident pixels of image ``k`` of a piece."""
+    """At most ``quota`` confident pixels of image ``k`` of a submodel."""
     points_cam = points_in_camera(placed, maps, k) * depth_scale
     with np.errstate(invalid="ignore"):
         confident = _finite(points_cam) & (maps.confidence(k) >= min_confidence) & (points_cam[..., 2] > 0)
@@ -245,7 +245,7 @@ def _sampled(
 
 
 def _gathered(
-    pieces: Sequence[PlacedPiece],
+    submodels: Sequence[PlacedSubmodel],
     dense: Sequence[DenseMaps],
     cameras: FusedCameras,
     depth_scale: FloatArray,
@@ -257,10 +257,10 @@ def _gathered(
     """Samples of all images, the usual distance of neighbouring pixels, and the number of pixels."""
     parts, spacings, num_pixels = [], [], 0
     world_from_cam = invert_rigid(cameras.cam_from_world)
-    each = zip(cameras.images, cameras.best_piece, depth_scale, world_from_cam, strict=True)
+    each = zip(cameras.images, cameras.best_submodel, depth_scale, world_from_cam, strict=True)
     for image, best, scale, pose in each:
-        k = pieces[best].piece.images.index(image)
-        sampled = _sampled(pieces[best], dense[best], k, float(scale), min_confidence=min_confidence, quota=quota)
+        k = submodels[best].submodel.images.index(image)
+        sampled = _sampled(submodels[best], dense[best], k, float(scale), min_confidence=min_confidence, quota=quota)
         parts.append(sampled.in_world(image, pose, origin))
         spacings += [sampled.spacing] if np.isfinite(sampled.spacing) else []
         num_pixels += sampled.num_pixels

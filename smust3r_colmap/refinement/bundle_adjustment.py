@@ -33,7 +33,7 @@ LOSS_SCALE_PX = 1.0
 MIN_ANGLE_DEG = 1.5
 """Of the rays of a point; COLMAP's own."""
 TRANSITIVITY = 2
-"""Matches of matches are correspondences, too. With one step tracks begin in many pieces, and merging these took 170 of
+"""Matches of matches are correspondences, too. With one step, tracks begin in many parts, and merging these took 170 of
 190 s for 1,000 images; with three, beginning them takes as long as that saves. The tracks are the same."""
 MIN_PRIORS = 3
 """Camera centres that hold a frame; fewer leave it turning."""

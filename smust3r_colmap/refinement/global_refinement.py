@@ -128,7 +128,7 @@ class RefinedFigures:
         final: figures of the model as it is stored.
         kept: the refined model stands; False where no image of it sees enough points to be adjusted by.
         principal_point: what became of it, and why.
-        doubts: what speaks against the model, in words.
+        warnings: what speaks against the model, in words.
         reason: why not, or empty.
     """
 
@@ -141,7 +141,7 @@ class RefinedFigures:
     final: ModelFigures
     kept: bool
     principal_point: str
-    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
     reason: str = ""
 
 
@@ -269,8 +269,8 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
         bench.filter(min(MAX_ERROR_PX, tight.pixels))
         if last.max_moved_percent < STILL_PERCENT or not last.kept:
             break
-    doubts = _doubts(steps, stay_bent=replacement.report is not None and are_any_bent(bench, features))
-    return _finished(task, bench, priors, stitched, steps, registered, principal_point, doubts)
+    warnings = _doubts(steps, stay_bent=replacement.report is not None and are_any_bent(bench, features))
+    return _finished(task, bench, priors, stitched, steps, registered, principal_point, warnings)
 
 
 def _triangulation(bench: Bench, tolerance: Tolerance, *, name: str = "triangulation") -> StepReport:
@@ -363,7 +363,7 @@ def _nothing_to_adjust(bench: Bench, priors: Priors, steps: list[StepReport]) ->
         final=figures_of(bench.model),
         kept=False,
         principal_point=STAYED,
-        doubts=(),
+        warnings=(),
         reason=reason,
     )
     return _Outcome(model=bench.model, consent=bench.consent, priors=priors, figures=figures)
@@ -377,7 +377,7 @@ def _finished(
     steps: list[StepReport],
     registered: tuple[int, ...],
     principal_point: str,
-    doubts: tuple[str, ...],
+    warnings: tuple[str, ...],
 ) -> _Outcome:
     model = bench.model
     weak = _put_back_weak_images(bench, stitched)
@@ -394,7 +394,7 @@ def _finished(
         final=figures_of(model),
         kept=some_sound,
         principal_point=principal_point,
-        doubts=doubts,
+        warnings=warnings,
         reason="" if some_sound else "no image sees enough points to be adjusted by",
     )
     return _Outcome(model=model, consent=bench.consent, priors=priors, figures=figures)
@@ -403,10 +403,10 @@ def _finished(
 def _doubts(steps: Sequence[StepReport], *, stay_bent: bool) -> tuple[str, ...]:
     """No adjustment stood, or images stay bent."""
     adjustments = [step for step in steps if "adjustment" in step.name]
-    doubts = [step.reason for step in steps if step.name == REPLACEMENT and not step.kept and stay_bent]
+    warnings = [step.reason for step in steps if step.name == REPLACEMENT and not step.kept and stay_bent]
     if adjustments and not any(step.kept for step in adjustments):
-        doubts.append(f"no adjustment stood: {adjustments[-1].reason}")
-    return tuple(doubts)
+        warnings.append(f"no adjustment stood: {adjustments[-1].reason}")
+    return tuple(warnings)
 
 
 def _completed(task: RefineTask, features: MatchedFeatures, outcomes: Sequence[_Outcome], scratch: Path) -> _Outcome:

@@ -322,7 +322,7 @@ def _not_refined(scenes: tuple[Scene, ...], folder: Path, reason: str) -> Refine
             final=final,
             kept=False,
             principal_point=STAYED,
-            doubts=(),
+            warnings=(),
             reason=reason,
         )
 
@@ -334,5 +334,5 @@ def _figures_from_json(facts: Mapping[str, Any]) -> RefinedFigures:
         StepReport(**{**step, "before": ModelFigures(**step["before"]), "after": ModelFigures(**step["after"])})
         for step in facts["steps"]
     )
-    listed = {name: tuple(facts[name]) for name in ("weak", "registered", "doubts")}
+    listed = {name: tuple(facts[name]) for name in ("weak", "registered", "warnings")}
     return RefinedFigures(**{**facts, **listed, "steps": steps, "final": ModelFigures(**facts["final"])})

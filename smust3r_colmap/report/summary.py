@@ -13,7 +13,6 @@ from typing import Any
 
 from smust3r_colmap.execution.progress import format_seconds
 from smust3r_colmap.execution.stage_clock import StageSummary
-from smust3r_colmap.products import MissingOutput
 
 EXIT_GOOD = 0
 EXIT_WEAK = 3
@@ -31,7 +30,7 @@ class ModelSummary:
         num_images: images with a pose in this model.
         num_points: points of its fused cloud.
         metric: lengths are metres.
-        segments: names of the segment pieces that were stitched.
+        segments: names of the submodels that were stitched.
     """
 
     folder: str
@@ -42,7 +41,7 @@ class ModelSummary:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImageRemark:
+class ImageNote:
     """An image that is missing from the result, and why."""
 
     name: str
@@ -57,27 +56,27 @@ class SegmentSummary:
         index: of the segment in the plan.
         kind: ``"window"`` or ``"loop"``.
         num_images: images it was given.
-        num_pieces: connected pieces that came out; 0 when nothing did.
-        num_registered: images with a pose, over all its pieces.
-        method: how its largest piece was made, in words; empty when nothing came out.
-        doubts: why its geometry should not be trusted.
+        num_submodels: connected submodels that came out; 0 when nothing did.
+        num_registered: images with a pose, over all its submodels.
+        method: how its largest submodel was made, in words; empty when nothing came out.
+        warnings: why its geometry should not be trusted.
     """
 
     index: int
     kind: str
     num_images: int
-    num_pieces: int
+    num_submodels: int
     num_registered: int
     method: str
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class EdgeSummary:
-    """An alignment between two segment pieces.
+    """An alignment between two submodels.
 
     Args:
-        target, source: names of the pieces.
+        target, source: names of the submodels.
         evidence: what it rests on: tracks, pointmaps, poses or links.
         relative_residual: median residual divided by depth; NaN when no transform was found.
         accepted: it took part in the stitching.
@@ -192,7 +191,7 @@ class RefinementSummary:
         weak: images with fewer than 15 observations, which keep their stitched place.
         registered: images that had no pose before.
         principal_point: whether it was freed, and why not, in words; empty where that was never asked.
-        doubts: what speaks against a model that has tracks, in words.
+        warnings: what speaks against a model that has tracks, in words.
         steps: in order.
     """
 
@@ -209,7 +208,7 @@ class RefinementSummary:
     weak: tuple[str, ...]
     registered: tuple[str, ...]
     principal_point: str
-    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
     steps: tuple[RefinementStep, ...]
 
 
@@ -228,11 +227,11 @@ class RunSummary:
         segments: in the order of the plan.
         edges: alignments that were tried.
         loops: that were planned. loops_note: why none could be looked for, or empty.
-        graph: the optimisation of the frames of all pieces.
+        graph: the optimisation of the frames of all submodels.
         peak_memory_bytes: largest resident size of this process or of one of its children.
         refinements: one per model; empty where none was wanted.
         missing_outputs: parts of the result that could not be written.
-        remarks: what was left out of those that were written.
+        notes: what was left out of those that were written.
 
     Raises:
         ValueError: the counts contradict each other, or there is no model.
@@ -242,8 +241,8 @@ class RunSummary:
     num_images: int
     num_registered: int
     models: tuple[ModelSummary, ...]
-    rejected: tuple[ImageRemark, ...]
-    unregistered: tuple[ImageRemark, ...]
+    rejected: tuple[ImageNote, ...]
+    unregistered: tuple[ImageNote, ...]
     stages: tuple[StageSummary, ...]
     segments: tuple[SegmentSummary, ...]
     edges: tuple[EdgeSummary, ...]
@@ -253,7 +252,7 @@ class RunSummary:
     peak_memory_bytes: int
     refinements: tuple[RefinementSummary, ...] = ()
     missing_outputs: tuple[MissingOutput, ...] = ()
-    remarks: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.models:
@@ -288,21 +287,23 @@ class RunSummary:
                 f"the images fall into {len(self.models)} models that could not be connected; "
                 f"the largest has {self.models[0].num_images} of {self.num_images} images"
             )
-        empty = [str(segment.index) for segment in self.segments if segment.kind == "window" and not segment.num_pieces]
+        empty = [
+            str(segment.index) for segment in self.segments if segment.kind == "window" and not segment.num_submodels
+        ]
         if empty:
             reasons.append(f"nothing came out of segment {', '.join(empty)}")
-        doubted = [segment for segment in self.segments if segment.doubts]
+        doubted = [segment for segment in self.segments if segment.warnings]
         if doubted:
             reasons.append(
                 f"the geometry of {len(doubted)} of {len(self.segments)} segments should not be trusted, such as "
-                f"segment {doubted[0].index}: {doubted[0].doubts[0]}"
+                f"segment {doubted[0].index}: {doubted[0].warnings[0]}"
             )
         if self.refinements and not self.refinements[0].kept:
             reasons.append(f"the largest model has no tracks: {self.refinements[0].reason}")
         num_weak = sum(len(one.weak) for one in self.refinements if one.kept)
         if num_weak:
             reasons.append(f"{num_weak} images rest on fewer than 15 observations; they keep their stitched place")
-        reasons += [f"{one.folder}: {doubt}" for one in self.refinements if one.kept for doubt in one.doubts]
+        reasons += [f"{one.folder}: {doubt}" for one in self.refinements if one.kept for doubt in one.warnings]
         reasons += [f"no {one.name}: {one.reason}" for one in self.missing_outputs]
         return tuple(reasons)
 
@@ -332,7 +333,7 @@ class RunSummary:
         lines += [line for one in self.refinements for line in _refinement_lines(one)]
         lines += _remark_lines("without a pose", self.unregistered)
         lines += _remark_lines("left out", self.rejected)
-        lines += [f"  {remark}" for remark in self.remarks]
+        lines += [f"  {note}" for note in self.notes]
         lines += [f"weak: {reason}" for reason in self.weak_reasons]
         lines.append(self._cost_line())
         lines.append(f"Result in {self.output}")
@@ -384,10 +385,10 @@ def _loop_lines(loops: tuple[LoopSummary, ...], note: str) -> list[str]:
     return lines
 
 
-def _remark_lines(what: str, remarks: tuple[ImageRemark, ...]) -> list[str]:
-    lines = [f"  {what}: {remark.name} ({remark.reason})" for remark in remarks[:_NAMES_SHOWN]]
-    if len(remarks) > _NAMES_SHOWN:
-        lines.append(f"  {what}: {len(remarks) - _NAMES_SHOWN} more, see summary.json")
+def _remark_lines(what: str, notes: tuple[ImageNote, ...]) -> list[str]:
+    lines = [f"  {what}: {note.name} ({note.reason})" for note in notes[:_NAMES_SHOWN]]
+    if len(notes) > _NAMES_SHOWN:
+        lines.append(f"  {what}: {len(notes) - _NAMES_SHOWN} more, see summary.json")
     return lines
 
 
@@ -399,3 +400,11 @@ def _without_nan(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+@dataclass(frozen=True, kw_only=True)
+class MissingOutput:
+    """A part of the result that could not be written, and why."""
+
+    name: str
+    reason: str

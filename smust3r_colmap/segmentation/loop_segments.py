@@ -1,6 +1,6 @@
 """Choosing loops among the images that look alike, and cutting their segments (paper section III-F).
 
-Every pair of segments with images that look alike is a candidate and gets a verdict in words. Whether
+Every pair of segments with images that look alike is a candidate and gets a decision in words. Whether
 a chosen loop is true is not decided here: its segment must first be reconstructed and agree with both
 sides, and the pose graph may still reject it.
 
@@ -67,7 +67,7 @@ class LoopCandidate:
         segment_a, segment_b: indices of the windows, ``segment_a < segment_b``.
         num_pairs: image pairs of the two segments that look alike.
         taken: a loop segment was planned.
-        reason: the verdict, for people.
+        reason: the decision, for people.
     """
 
     image_a: int

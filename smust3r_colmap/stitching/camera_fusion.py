@@ -15,10 +15,10 @@ from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.geometry.so3 import angles_between, nearest_rotation
 from smust3r_colmap.products import DenseMaps, ImageCollection, PointCloud, Scene
-from smust3r_colmap.stitching.resection import PlacedPiece
+from smust3r_colmap.stitching.resection import PlacedSubmodel
 
 OUTLIER_RATIO = 5.0
-"""A pose is left out beyond this many times the usual disagreement of its two pieces. Drift that grows
+"""A pose is left out beyond this many times the usual disagreement of its two submodels. Drift that grows
 along an overlap reaches two to four times its own median, and is to be blended, not cut."""
 LONGEST_HOLE = 5
 """Images missing in a row that do not end a run: a few blurred frames do not take an image's
@@ -27,26 +27,26 @@ neighbours away, but the two sides of a loop are no neighbours."""
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FusedCameras:
-    """One pose per image of a connected part, with what the pieces said about each other.
+    """One pose per image of a connected part, with what the submodels said about each other.
 
     Args:
         images: (N,) indices into the collection, ascending.
         cam_from_world: (N, 3, 4) rigid.
-        num_pieces: (N,) pieces that speak for the image: the windows that hold it, else the loop pieces.
+        num_submodels: (N,) submodels that speak for the image: the windows that hold it, else the loop submodels.
         num_dropped: (N,) of these, poses left out because they disagree with the rest.
-        best_piece: (N,) position of the piece, among those used, where the image lies most central.
-        position_spread: (N,) largest distance between two pieces' centres of the image, as a part of
-            ``scene_radius``; dropped poses count too; NaN where one piece holds the image.
+        best_submodel: (N,) position of the submodel, among those used, where the image lies most central.
+        position_spread: (N,) largest distance between two submodels' centres of the image, as a part of
+            ``scene_radius``; dropped poses count too; NaN where one submodel holds the image.
         rotation_spread_deg: (N,) the same for the rotations, in degrees.
-        residual_px: (N,) of the image's camera in its best piece, see ``PlacedPiece``.
+        residual_px: (N,) of the image's camera in its best submodel, see ``PlacedSubmodel``.
         scene_radius: median distance of the camera centres from their median, in world units.
     """
 
     images: tuple[int, ...]
     cam_from_world: FloatArray
-    num_pieces: IntArray
+    num_submodels: IntArray
     num_dropped: IntArray
-    best_piece: IntArray
+    best_submodel: IntArray
     position_spread: FloatArray
     rotation_spread_deg: FloatArray
     residual_px: FloatArray
@@ -54,7 +54,7 @@ class FusedCameras:
 
     def __post_init__(self) -> None:
         n = len(self.images)
-        counts = ("num_pieces", "num_dropped", "best_piece")
+        counts = ("num_submodels", "num_dropped", "best_submodel")
         for name in (*counts, "position_spread", "rotation_spread_deg", "residual_px"):
             if getattr(self, name).shape != (n,):
                 raise ValueError(f"FusedCameras: {n} images, {name} {getattr(self, name).shape}")
@@ -64,9 +64,9 @@ class FusedCameras:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Sightings:
-    """What the pieces say about one image; leading axis: the pieces that hold it."""
+    """What the submodels say about one image; leading axis: the submodels that hold it."""
 
-    pieces: tuple[int, ...]
+    submodels: tuple[int, ...]
     world_from_cam: FloatArray  # (K, 3, 4)
     weights: FloatArray  # (K,) centrality
 
@@ -77,34 +77,34 @@ class _Sightings:
         return distances, np.rad2deg(angles_between(rotations[:, None], rotations[None]))
 
 
-def fuse_cameras(pieces: Sequence[PlacedPiece]) -> FusedCameras:
+def fuse_cameras(submodels: Sequence[PlacedSubmodel]) -> FusedCameras:
     """One pose per image: centres by weighted mean, rotations by weighted chordal mean.
 
-    The weight is the image's ``centrality`` in each piece, so through an overlap the trajectory passes
-    steadily from one piece to the next. Poses that disagree are treated in two ways. A disagreement as
-    large as usual between these two pieces is drift: it is blended. A pose farther than
-    ``OUTLIER_RATIO`` times that from the weighted medoid of its image is an accident of one piece: it
+    The weight is the image's ``centrality`` in each submodel, so through an overlap the trajectory passes
+    steadily from one submodel to the next. Poses that disagree are treated in two ways. A disagreement as
+    large as usual between these two submodels is drift: it is blended. A pose farther than
+    ``OUTLIER_RATIO`` times that from the weighted medoid of its image is an accident of one submodel: it
     is left out and counted. Of three poses the medoid is the majority, of two the more central one.
-    An accident is told from drift where two pieces share at least three images; two that disagree on
+    An accident is told from drift where two submodels share at least three images; two that disagree on
     every image they share are blended all the same, and the spread tells.
 
     Args:
-        pieces: of one connected part, placed in its world.
+        submodels: of one connected part, placed in its world.
 
     Raises:
-        ValueError: no piece.
+        ValueError: no submodel.
 
     Source: chordal mean after Hartley, Trumpf, Dai and Li, Rotation Averaging, IJCV 2013.
     """
-    if not pieces:
-        raise ValueError("fusion: no piece, needed at least one")
-    sightings = _sightings_by_image(pieces)
+    if not submodels:
+        raise ValueError("fusion: no submodel, needed at least one")
+    sightings = _sightings_by_image(submodels)
     centres = np.concatenate([sighting.world_from_cam[:, :, 3] for sighting in sightings.values()])
     radius = float(np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
     usual = _usual_disagreement(sightings.values(), radius)
     kept = [_agreeing(sighting, usual) for sighting in sightings.values()]
     spread = [[matrix.max() for matrix in sighting.disagreement()] for sighting in sightings.values()]
-    alone = np.array([len(sighting.pieces) == 1 for sighting in sightings.values()])
+    alone = np.array([len(sighting.submodels) == 1 for sighting in sightings.values()])
     distance, angle_deg = np.array(spread).T
     world_from_cam = np.stack(
         [
@@ -112,24 +112,24 @@ def fuse_cameras(pieces: Sequence[PlacedPiece]) -> FusedCameras:
             for sighting, keep in zip(sightings.values(), kept, strict=True)
         ]
     )
-    best_piece = np.array(
+    best_submodel = np.array(
         [
-            sighting.pieces[int(np.argmax(np.where(keep, sighting.weights, 0)))]
+            sighting.submodels[int(np.argmax(np.where(keep, sighting.weights, 0)))]
             for sighting, keep in zip(sightings.values(), kept, strict=True)
         ]
     )
     return FusedCameras(
         images=tuple(sightings),
         cam_from_world=invert_rigid(world_from_cam),
-        num_pieces=np.array([len(keep) for keep in kept]),
+        num_submodels=np.array([len(keep) for keep in kept]),
         num_dropped=np.array([np.count_nonzero(~keep) for keep in kept]),
-        best_piece=best_piece,
+        best_submodel=best_submodel,
         position_spread=np.where(alone, np.nan, distance / radius if radius > 0 else distance),
         rotation_spread_deg=np.where(alone, np.nan, angle_deg),
         residual_px=np.array(
             [
-                pieces[best].residual_px[pieces[best].piece.images.index(image)]
-                for image, best in zip(sightings, best_piece, strict=True)
+                submodels[best].residual_px[submodels[best].submodel.images.index(image)]
+                for image, best in zip(sightings, best_submodel, strict=True)
             ]
         ),
         scene_radius=radius,
@@ -137,7 +137,7 @@ def fuse_cameras(pieces: Sequence[PlacedPiece]) -> FusedCameras:
 
 
 def centrality(images: Sequence[int]) -> FloatArray:
-    """(N,) weight of each image of a piece, in (0, 1]: falls linearly from the middle of its run to the ends.
+    """(N,) weight of each image of a submodel, in (0, 1]: falls linearly from the middle of its run to the ends.
 
     An image in the middle of a run has neighbours on both sides, one at its end on one side only. A
     run ends where more than ``LONGEST_HOLE`` images are missing.
@@ -152,25 +152,25 @@ def centrality(images: Sequence[int]) -> FloatArray:
     return weights
 
 
-def speaking_images(pieces: Sequence[PlacedPiece]) -> list[npt.NDArray[np.bool_]]:
-    """Per piece, (N,) for which of its images it counts: all of a window's, of a loop's those no window holds."""
-    in_windows = {image for placed in pieces if not placed.is_loop for image in placed.piece.images}
+def speaking_images(submodels: Sequence[PlacedSubmodel]) -> list[npt.NDArray[np.bool_]]:
+    """Per submodel, (N,) for which of its images it counts: all of a window's, of a loop's those no window holds."""
+    in_windows = {image for placed in submodels if not placed.is_loop for image in placed.submodel.images}
     return [
-        np.array([not (placed.is_loop and image in in_windows) for image in placed.piece.images], dtype=np.bool_)
-        for placed in pieces
+        np.array([not (placed.is_loop and image in in_windows) for image in placed.submodel.images], dtype=np.bool_)
+        for placed in submodels
     ]
 
 
-def _sightings_by_image(pieces: Sequence[PlacedPiece]) -> dict[int, _Sightings]:
-    """Per image, ascending, what each piece that speaks for it says."""
+def _sightings_by_image(submodels: Sequence[PlacedSubmodel]) -> dict[int, _Sightings]:
+    """Per image, ascending, what each submodel that speaks for it says."""
     found: dict[int, list[tuple[int, FloatArray, float]]] = defaultdict(list)
-    for position, (placed, speaks) in enumerate(zip(pieces, speaking_images(pieces), strict=True)):
-        weights = centrality(placed.piece.images)
+    for position, (placed, speaks) in enumerate(zip(submodels, speaking_images(submodels), strict=True)):
+        weights = centrality(placed.submodel.images)
         for k in np.flatnonzero(speaks):
-            found[placed.piece.images[k]].append((position, placed.world_from_cam[k], weights[k]))
+            found[placed.submodel.images[k]].append((position, placed.world_from_cam[k], weights[k]))
     return {
         image: _Sightings(
-            pieces=tuple(position for position, _, _ in found[image]),
+            submodels=tuple(position for position, _, _ in found[image]),
             world_from_cam=np.stack([pose for _, pose, _ in found[image]]),
             weights=np.array([weight for _, _, weight in found[image]]),
         )
@@ -179,15 +179,15 @@ def _sightings_by_image(pieces: Sequence[PlacedPiece]) -> dict[int, _Sightings]:
 
 
 def _usual_disagreement(sightings: Iterable[_Sightings], radius: float) -> dict[tuple[int, int], tuple[float, float]]:
-    """Per pair of pieces, the median distance and angle in degrees over the images they share.
+    """Per pair of submodels, the median distance and angle in degrees over the images they share.
 
     Never less than rounding: 1e-6 of the scene's radius and 1e-4 degrees.
     """
     found: dict[tuple[int, int], list[tuple[float, float]]] = defaultdict(list)
     for sighting in sightings:
         distances, angles_deg = sighting.disagreement()
-        for a, b in combinations(range(len(sighting.pieces)), 2):
-            found[sighting.pieces[a], sighting.pieces[b]].append((distances[a, b], angles_deg[a, b]))
+        for a, b in combinations(range(len(sighting.submodels)), 2):
+            found[sighting.submodels[a], sighting.submodels[b]].append((distances[a, b], angles_deg[a, b]))
     usual = {}
     for pair, values in found.items():
         distance, angle_deg = np.median(values, axis=0)
@@ -199,8 +199,8 @@ def _agreeing(sighting: _Sightings, usual: dict[tuple[int, int], tuple[float, fl
     """(K,) which poses lie near the weighted medoid, in units of the usual disagreement."""
     distances, angles_deg = sighting.disagreement()
     ratio = np.zeros_like(distances)
-    for a, b in combinations(range(len(sighting.pieces)), 2):
-        usual_distance, usual_angle_deg = usual[sighting.pieces[a], sighting.pieces[b]]
+    for a, b in combinations(range(len(sighting.submodels)), 2):
+        usual_distance, usual_angle_deg = usual[sighting.submodels[a], sighting.submodels[b]]
         by_distance = distances[a, b] / usual_distance if usual_distance > 0 else 0.0
         ratio[a, b] = ratio[b, a] = max(by_distance, angles_deg[a, b] / usual_angle_deg)
     medoid = int(np.argmin(ratio @ sighting.weights))
@@ -216,26 +216,26 @@ def _mean_pose(world_from_cam: FloatArray, weights: FloatArray) -> FloatArray:
     return mean
 
 
-def fuse_intrinsics(pieces: Sequence[PlacedPiece], camera_of_image: Sequence[int]) -> dict[int, Intrinsics]:
+def fuse_intrinsics(submodels: Sequence[PlacedSubmodel], camera_of_image: Sequence[int]) -> dict[int, Intrinsics]:
     """One calibration per camera: the median of each parameter over all registered images.
 
-    A piece counts as often as it speaks for an image of the camera (``speaking_images``). Where pieces
+    A submodel counts as often as it speaks for an image of the camera (``speaking_images``). Where submodels
     disagree about the camera model, the model of most images is taken and the others have no say.
 
     Args:
-        pieces: of one connected part, intrinsics at the original image size.
+        submodels: of one connected part, intrinsics at the original image size.
         camera_of_image: camera of every image of the collection.
 
     Returns:
         By camera index, ascending; only cameras with a registered image.
 
     Raises:
-        ValueError: two pieces hold one camera at different image sizes.
+        ValueError: two submodels hold one camera at different image sizes.
     """
     found: dict[int, list[Intrinsics]] = defaultdict(list)
-    for placed, speaks in zip(pieces, speaking_images(pieces), strict=True):
+    for placed, speaks in zip(submodels, speaking_images(submodels), strict=True):
         for k in np.flatnonzero(speaks):
-            found[camera_of_image[placed.piece.images[k]]].append(placed.piece.intrinsics[k])
+            found[camera_of_image[placed.submodel.images[k]]].append(placed.submodel.intrinsics[k])
     return {camera: _median_intrinsics(camera, found[camera]) for camera in sorted(found)}
 
 
@@ -243,7 +243,7 @@ def _median_intrinsics(camera: int, candidates: Sequence[Intrinsics]) -> Intrins
     """The median of those that have the most frequent model."""
     sizes = {(candidate.width, candidate.height) for candidate in candidates}
     if len(sizes) > 1:
-        raise ValueError(f"camera {camera}: pieces hold it at sizes {sorted(sizes)}, needed the original size only")
+        raise ValueError(f"camera {camera}: submodels hold it at sizes {sorted(sizes)}, needed the original size only")
     model = Counter(candidate.model for candidate in candidates).most_common(1)[0][0]
     same = [candidate for candidate in candidates if candidate.model == model]
     params = np.median([candidate.params for candidate in same], axis=0)
@@ -252,20 +252,20 @@ def _median_intrinsics(camera: int, candidates: Sequence[Intrinsics]) -> Intrins
 
 
 def depth_in_cameras(
-    pieces: Sequence[PlacedPiece], dense: Sequence[DenseMaps], cameras: FusedCameras
+    submodels: Sequence[PlacedSubmodel], dense: Sequence[DenseMaps], cameras: FusedCameras
 ) -> Iterator[tuple[int, npt.NDArray[np.float32], npt.NDArray[np.float32]]]:
     """Per image its index, its depth (H, W) in world units, 0 where there is none, and its confidence (H, W).
 
-    Each image gives its map once, from ``cameras.best_piece``; arguments as for ``fuse_points``.
+    Each image gives its map once, from ``cameras.best_submodel``; arguments as for ``fuse_points``.
     """
-    for image, best in zip(cameras.images, cameras.best_piece, strict=True):
-        k = pieces[best].piece.images.index(image)
-        depth = points_in_camera(pieces[best], dense[best], k)[..., 2]
+    for image, best in zip(cameras.images, cameras.best_submodel, strict=True):
+        k = submodels[best].submodel.images.index(image)
+        depth = points_in_camera(submodels[best], dense[best], k)[..., 2]
         yield image, np.where(np.nan_to_num(depth) > 0, depth, 0).astype(np.float32), dense[best].confidence(k)
 
 
-def points_in_camera(placed: PlacedPiece, maps: DenseMaps, k: int) -> FloatArray:
-    """(H, W, 3) of image ``k`` of a piece, moved from the segment through the world into its camera there."""
+def points_in_camera(placed: PlacedSubmodel, maps: DenseMaps, k: int) -> FloatArray:
+    """(H, W, 3) of image ``k`` of a submodel, moved from the segment through the world into its camera there."""
     pointmap_seg = maps.pointmap_seg(k)
     cam_from_world = invert_rigid(placed.world_from_cam[k])
     with np.errstate(invalid="ignore", divide="ignore"):  # a projective transform has a plane at infinity
@@ -276,7 +276,7 @@ def points_in_camera(placed: PlacedPiece, maps: DenseMaps, k: int) -> FloatArray
 
 def build_scene(
     collection: ImageCollection,
-    pieces: Sequence[PlacedPiece],
+    submodels: Sequence[PlacedSubmodel],
     cameras: FusedCameras,
     intrinsics: dict[int, Intrinsics],
     points: PointCloud,
@@ -287,7 +287,7 @@ def build_scene(
 
     Args:
         collection: all images of the run.
-        pieces: of this connected part; the first is the world frame. Pieces of loops are named too.
+        submodels: of this connected part; the first is the world frame. Submodels of loops are named too.
         cameras, intrinsics, points: what the three fusions made of them.
         metric: lengths are metres.
     """
@@ -300,5 +300,5 @@ def build_scene(
         cam_from_world=cameras.cam_from_world,
         points=points,
         metric=metric,
-        segments=tuple(placed.piece.name for placed in pieces),
+        segments=tuple(placed.submodel.name for placed in submodels),
     )

@@ -1,7 +1,7 @@
 """The geometric proof that a loop has to give before it may bend anything.
 
 Two places that look alike need not be one. A planned loop is believed when its segment came out in
-one piece that holds both ends, when that piece fits the windows on both sides, and when the way
+one submodel that holds both ends, when that submodel fits the windows on both sides, and when the way
 through it ends where the chain of windows ends, as far as their uncertainties tell. What a chain too
 long to be sure of anything lets pass is left to the robust kernel of the pose graph.
 The next module to read is ``stitching``.
@@ -20,12 +20,12 @@ import numpy as np
 
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.products import SegmentAlignment, SegmentPiece, consecutive_runs
+from smust3r_colmap.products import SegmentAlignment, Submodel, consecutive_runs
 from smust3r_colmap.segmentation.loop_segments import PlannedLoop
 from smust3r_colmap.stitching.spanning_tree import ChainedPart
 
 MIN_END_IMAGES = 3
-"""Images of each end that the loop piece must hold and share with a window."""
+"""Images of each end that the loop submodel must hold and share with a window."""
 MAX_CLOSURE_SIGMAS = 5.0
 """Between the way through the loop and the chain, per degree of freedom. The covariances are good to a
 factor of two or three, so this refuses what is absurd and leaves the rest to the graph."""
@@ -34,11 +34,11 @@ NOTHING_KNOWN = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True)
-class LoopVerdict:
+class LoopDecision:
     """What became of a planned loop.
 
     Args:
-        piece: position of the piece that holds both ends, or None.
+        submodel: position of the submodel that holds both ends, or None.
         edges: positions of the alignments with a window of the first and of the second end; empty where
             one is missing.
         accepted: it takes part in the graph.
@@ -47,7 +47,7 @@ class LoopVerdict:
             per degree of freedom; NaN where there is no chain between the ends.
     """
 
-    piece: int | None
+    submodel: int | None
     accepted: bool
     edges: tuple[int, ...] = ()
     reason: str = ""
@@ -90,39 +90,39 @@ class UncertainTransform:
 
 def verify_loops(
     loops: Sequence[PlannedLoop],
-    pieces: Sequence[SegmentPiece],
+    submodels: Sequence[Submodel],
     alignments: Sequence[SegmentAlignment],
     chained: Sequence[ChainedPart],
-) -> tuple[LoopVerdict, ...]:
-    """One verdict per loop, each on its own.
+) -> tuple[LoopDecision, ...]:
+    """One decision per loop, each on its own.
 
     Args:
         loops: as planned.
-        pieces: of windows and loop segments.
+        submodels: of windows and loop segments.
         alignments: between them; only accepted ones count.
         chained: the windows without any loop.
     """
     chain = _Chain(alignments, chained)
-    return tuple(_verify(loop, pieces, alignments, chain) for loop in loops)
+    return tuple(_verify(loop, submodels, alignments, chain) for loop in loops)
 
 
 def _verify(
-    loop: PlannedLoop, pieces: Sequence[SegmentPiece], alignments: Sequence[SegmentAlignment], chain: _Chain
-) -> LoopVerdict:
+    loop: PlannedLoop, submodels: Sequence[Submodel], alignments: Sequence[SegmentAlignment], chain: _Chain
+) -> LoopDecision:
     ends = [set(run) for run in consecutive_runs(loop.segment.images)]
-    own = [k for k, piece in enumerate(pieces) if piece.segment == loop.segment.index]
-    held = {k: [len(end & set(pieces[k].images)) for end in ends] for k in own}
+    own = [k for k, submodel in enumerate(submodels) if submodel.segment == loop.segment.index]
+    held = {k: [len(end & set(submodels[k].images)) for end in ends] for k in own}
     if not own or max(min(counts) for counts in held.values()) < MIN_END_IMAGES:
-        return LoopVerdict(piece=None, accepted=False, reason=_why_no_piece(list(held.values())))
+        return LoopDecision(submodel=None, accepted=False, reason=_why_no_submodel(list(held.values())))
     best = max(own, key=lambda k: (min(held[k]), sum(held[k])))
-    sides = [_best_edge(best, end, pieces, alignments) for end in ends]
+    sides = [_best_edge(best, end, submodels, alignments) for end in ends]
     edges = tuple(side for side in sides if side is not None)
     if len(edges) < len(ends):
-        return LoopVerdict(piece=best, accepted=False, reason=_why_no_edge(best, sides, alignments))
+        return LoopDecision(submodel=best, accepted=False, reason=_why_no_edge(best, sides, alignments))
     first, second = (alignments[edge] for edge in edges)
     sigmas, reason = np.nan, ""
     if first.target == second.target:
-        reason = f"window {pieces[first.target].name} holds both ends"
+        reason = f"window {submodels[first.target].name} holds both ends"
     elif chain.connects(first.target, second.target):
         through_loop = _of_edge(first) @ _of_edge(second).inverse()
         sigmas = chain.transform(first.target, second.target).sigmas_from(through_loop)
@@ -131,36 +131,36 @@ def _verify(
                 f"it contradicts the chain of windows by {sigmas:.1f} standard deviations, "
                 f"at most {MAX_CLOSURE_SIGMAS:.0f}"
             )
-    return LoopVerdict(piece=best, accepted=not reason, edges=edges, reason=reason, closure_sigmas=sigmas)
+    return LoopDecision(submodel=best, accepted=not reason, edges=edges, reason=reason, closure_sigmas=sigmas)
 
 
-def _why_no_piece(held: Sequence[Sequence[int]]) -> str:
-    """What is wrong with pieces that hold so many images of each end."""
+def _why_no_submodel(held: Sequence[Sequence[int]]) -> str:
+    """What is wrong with submodels that hold so many images of each end."""
     if not held:
         return "nothing came out of the loop segment"
     counts = ", ".join(" + ".join(map(str, one)) for one in held)
-    return f"no piece of the loop segment holds {MIN_END_IMAGES} images of both ends (pieces of {counts})"
+    return f"no submodel of the loop segment holds {MIN_END_IMAGES} images of both ends (submodels of {counts})"
 
 
-def _why_no_edge(loop_piece: int, sides: Sequence[int | None], alignments: Sequence[SegmentAlignment]) -> str:
+def _why_no_edge(loop_submodel: int, sides: Sequence[int | None], alignments: Sequence[SegmentAlignment]) -> str:
     missing = [end for end, side in zip(("first", "second"), sides, strict=True) if side is None]
-    tried = [edge.reason for edge in alignments if edge.source == loop_piece and edge.reason]
+    tried = [edge.reason for edge in alignments if edge.source == loop_submodel and edge.reason]
     reason = f"no sound edge between the loop segment and a window of the {' and the '.join(missing)} end"
     return "; ".join([reason, *tried[:2]])
 
 
 def _best_edge(
-    loop_piece: int, end: set[int], pieces: Sequence[SegmentPiece], alignments: Sequence[SegmentAlignment]
+    loop_submodel: int, end: set[int], submodels: Sequence[Submodel], alignments: Sequence[SegmentAlignment]
 ) -> int | None:
-    """Position of the accepted edge of most inliers from the loop piece to a window that shares enough of this end."""
+    """Position of the accepted edge of most inliers from the loop submodel to a window sharing enough of this end."""
 
     def shares_enough(window: int) -> bool:
-        return len(end & set(pieces[loop_piece].images) & set(pieces[window].images)) >= MIN_END_IMAGES
+        return len(end & set(submodels[loop_submodel].images) & set(submodels[window].images)) >= MIN_END_IMAGES
 
     edges = [
         position
         for position, edge in enumerate(alignments)
-        if edge.accepted and edge.source == loop_piece and shares_enough(edge.target)
+        if edge.accepted and edge.source == loop_submodel and shares_enough(edge.target)
     ]
     return max(edges, key=lambda position: alignments[position].estimate.num_inliers, default=None)
 
@@ -185,7 +185,7 @@ class _Chain:
     """The spanning trees of the windows, with the uncertainty that adds up along them."""
 
     def __init__(self, alignments: Sequence[SegmentAlignment], parts: Sequence[ChainedPart]) -> None:
-        self._part = {piece: number for number, part in enumerate(parts) for piece in part.pieces}
+        self._part = {submodel: number for number, part in enumerate(parts) for submodel in part.submodels}
         self._steps: Mapping[int, dict[int, UncertainTransform]] = defaultdict(dict)
         for part in parts:
             for position in part.edges:

@@ -1,7 +1,7 @@
-"""Placing the cameras of a piece in the world when the world is not a mere similarity of the piece.
+"""Placing the cameras of a submodel in the world when the world is not a mere similarity of the submodel.
 
-Under Sim(3) and SE(3) a camera moves with its piece. Affine(3) and SL(4) bend the piece, and no rigid
-camera sees the bent points quite as the piece's own camera saw the straight ones: it is found anew,
+Under Sim(3) and SE(3) a camera moves with its submodel. Affine(3) and SL(4) bend the submodel, and no rigid
+camera sees the bent points quite as the submodel's own camera saw the straight ones: it is found anew,
 image by image, and what remains is reported in pixels. The next module to read is ``fusion``.
 """
 
@@ -19,7 +19,7 @@ from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
 from smust3r_colmap.geometry.so3 import skew
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.products import DenseMaps, SegmentPiece
+from smust3r_colmap.products import DenseMaps, Submodel
 
 logger = logging.getLogger(__name__)
 
@@ -36,65 +36,67 @@ CONVERGED_STEP = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PlacedPiece:
-    """A piece with its cameras in the world.
+class PlacedSubmodel:
+    """A submodel with its cameras in the world.
 
     Args:
-        piece: as reconstructed, in its own frame.
+        submodel: as reconstructed, in its own frame.
         world_from_seg: in any group.
-        world_from_cam: (N, 3, 4) rigid, one per image of the piece.
+        world_from_cam: (N, 3, 4) rigid, one per image of the submodel.
         residual_px: (N,) root mean square distance, in pixels of the original image, between where the
-            camera sees the moved points and where the piece's own camera saw them; 0 for groups
+            camera sees the moved points and where the submodel's own camera saw them; 0 for groups
             that keep angles, NaN where too few points were there and the camera moved by itself.
-        is_loop: the piece is of a loop segment, which ties the graph and places no image that a window
+        is_loop: the submodel is of a loop segment, which ties the graph and places no image that a window
             placed.
     """
 
-    piece: SegmentPiece
+    submodel: Submodel
     world_from_seg: Transform
     world_from_cam: FloatArray
     residual_px: FloatArray
     is_loop: bool
 
     def __post_init__(self) -> None:
-        n = len(self.piece.images)
+        n = len(self.submodel.images)
         if self.world_from_cam.shape != (n, 3, 4) or self.residual_px.shape != (n,):
             raise ValueError(
-                f"piece {self.piece.name}: {n} images, placed {self.world_from_cam.shape}, "
+                f"submodel {self.submodel.name}: {n} images, placed {self.world_from_cam.shape}, "
                 f"residuals {self.residual_px.shape}"
             )
         if not np.isfinite(self.world_from_cam).all():
-            raise ValueError(f"piece {self.piece.name}: a placed camera is not finite")
+            raise ValueError(f"submodel {self.submodel.name}: a placed camera is not finite")
 
 
-def place_piece(
-    piece: SegmentPiece, maps: DenseMaps, world_from_seg: Transform, *, is_loop: bool = False
-) -> PlacedPiece:
-    """The cameras of a piece in the world, rigid in every group.
+def place_submodel(
+    submodel: Submodel, maps: DenseMaps, world_from_seg: Transform, *, is_loop: bool = False
+) -> PlacedSubmodel:
+    """The cameras of a submodel in the world, rigid in every group.
 
     Sim(3) and SE(3) move them exactly. In the wider groups each camera is resected from the points it
-    saw: tracks where the piece has them, else pixels of its pointmap. The pixel of a point is where
-    the piece's own camera projects it, so the residual is what the bending adds and nothing else, and
+    saw: tracks where the submodel has them, else pixels of its pointmap. The pixel of a point is where
+    the submodel's own camera projects it, so the residual is what the bending adds and nothing else, and
     a transform that happens to be a similarity gives zero. Levenberg-Marquardt over all images at once, from
     the centre moved by the transform and the rotation nearest to its Jacobian there.
 
     Args:
-        piece: in its own frame.
+        submodel: in its own frame.
         maps: of its images; read only where they are needed.
-        world_from_seg: of the piece.
+        world_from_seg: of the submodel.
         is_loop: carried into the result.
 
     Raises:
         DegenerateAlignmentError: a projective transform sends a camera to infinity or beyond.
     """
-    world_from_cam = moved_cameras(world_from_seg, piece.seg_from_cam)
-    residual_px = np.zeros(len(piece.images))
+    world_from_cam = moved_cameras(world_from_seg, submodel.seg_from_cam)
+    residual_px = np.zeros(len(submodel.images))
     if not isinstance(world_from_seg, Sim3 | SE3):
-        cam_from_world, residual_px = _resected(invert_rigid(world_from_cam), _seen_points(piece, maps, world_from_seg))
+        cam_from_world, residual_px = _resected(
+            invert_rigid(world_from_cam), _seen_points(submodel, maps, world_from_seg)
+        )
         world_from_cam = invert_rigid(cam_from_world)
-        _warn_of_unseen(piece, residual_px)
-    return PlacedPiece(
-        piece=piece,
+        _warn_of_unseen(submodel, residual_px)
+    return PlacedSubmodel(
+        submodel=submodel,
         world_from_seg=world_from_seg,
         world_from_cam=world_from_cam,
         residual_px=residual_px,
@@ -119,12 +121,12 @@ def moved_cameras(b_from_a: Transform, a_from_cam: FloatArray) -> FloatArray:
     return b_from_cam
 
 
-def _warn_of_unseen(piece: SegmentPiece, residual_px: FloatArray) -> None:
+def _warn_of_unseen(submodel: Submodel, residual_px: FloatArray) -> None:
     unseen = int(np.isnan(residual_px).sum())
     if unseen:
         logger.warning(
-            "piece %s: %d of %d cameras see fewer than %d points and are placed without them",
-            piece.name,
+            "submodel %s: %d of %d cameras see fewer than %d points and are placed without them",
+            submodel.name,
             unseen,
             len(residual_px),
             MIN_POINTS,
@@ -147,12 +149,12 @@ class _SeenPoints:
     focal_px: FloatArray
 
 
-def _seen_points(piece: SegmentPiece, maps: DenseMaps, world_from_seg: Transform) -> _SeenPoints:
-    n, p = len(piece.images), POINTS_PER_IMAGE
+def _seen_points(submodel: Submodel, maps: DenseMaps, world_from_seg: Transform) -> _SeenPoints:
+    n, p = len(submodel.images), POINTS_PER_IMAGE
     points_world, xy, weights = np.zeros((n, p, 3)), np.zeros((n, p, 2)), np.zeros((n, p))
-    cam_from_seg = invert_rigid(piece.seg_from_cam)
+    cam_from_seg = invert_rigid(submodel.seg_from_cam)
     for k in range(n):
-        points_seg = _points_of_image(piece, maps, k)
+        points_seg = _points_of_image(submodel, maps, k)
         with np.errstate(invalid="ignore", divide="ignore"):
             points_cam = points_seg @ cam_from_seg[k, :, :3].T + cam_from_seg[k, :, 3]
             moved = world_from_seg.apply(points_seg)
@@ -162,15 +164,15 @@ def _seen_points(piece: SegmentPiece, maps: DenseMaps, world_from_seg: Transform
         points_world[k, : len(rows)] = moved[rows]
         xy[k, : len(rows)] = points_cam[rows, :2] / points_cam[rows, 2:]
         weights[k, : len(rows)] = 1.0
-    focal_px = np.array([intrinsics.focal_px for intrinsics in piece.intrinsics])
+    focal_px = np.array([intrinsics.focal_px for intrinsics in submodel.intrinsics])
     return _SeenPoints(points_world=points_world, xy=xy, weights=weights, focal_px=focal_px)
 
 
-def _points_of_image(piece: SegmentPiece, maps: DenseMaps, k: int) -> FloatArray:
+def _points_of_image(submodel: Submodel, maps: DenseMaps, k: int) -> FloatArray:
     """(P, 3) in the segment frame: the track points image k observes, or pixels of its map."""
-    if piece.tracks is not None:
-        seen = piece.tracks.image_of_observation == piece.images[k]
-        observed: FloatArray = piece.tracks.points_seg[np.unique(piece.tracks.point_of_observation[seen])]
+    if submodel.tracks is not None:
+        seen = submodel.tracks.image_of_observation == submodel.images[k]
+        observed: FloatArray = submodel.tracks.points_seg[np.unique(submodel.tracks.point_of_observation[seen])]
         return observed
     confident: FloatArray = maps.pointmap_seg(k)[maps.confidence(k) > 1].astype(np.float64)
     return confident

@@ -1,7 +1,7 @@
-"""From alignments between pieces to one frame per connected part.
+"""From alignments between submodels to one frame per connected part.
 
 The chain is the best spanning tree of the accepted edges: the one whose edges rest on most inliers.
-In a plain sequence that is the chain of neighbouring segments; where a segment came out in pieces,
+In a plain sequence that is the chain of neighbouring segments; where a segment came out in submodels,
 it is whatever holds them together. What no edge reaches stays a part of its own. The pose graph
 takes the chain as its start; the next module to read is ``stitching``.
 """
@@ -25,30 +25,30 @@ LOOP_HANDICAP = 1e-6
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ChainedPart:
-    """Pieces that hang together, in the frame of the first of them.
+    """Submodels that hang together, in the frame of the first of them.
 
     Args:
-        pieces: positions in the list of all pieces; the first is the world frame.
-        world_from_seg: one per piece, the first the identity; all in one group.
+        submodels: positions in the list of all submodels; the first is the world frame.
+        world_from_seg: one per submodel, the first the identity; all in one group.
         edges: positions of the alignments in the spanning tree.
     """
 
-    pieces: tuple[int, ...]
+    submodels: tuple[int, ...]
     world_from_seg: tuple[Transform, ...]
     edges: tuple[int, ...]
 
 
-def chain_pieces(
+def chain_submodels(
     nodes: Sequence[int],
     alignments: Sequence[SegmentAlignment],
     *,
     loops: Collection[int] = (),
     group: type[Transform] = Sim3,
 ) -> tuple[ChainedPart, ...]:
-    """Connected parts of the pieces, each chained along its best spanning tree.
+    """Connected parts of the submodels, each chained along its best spanning tree.
 
     Args:
-        nodes: positions of the pieces that take part; the lowest is its part's world frame (paper
+        nodes: positions of the submodels that take part; the lowest is its part's world frame (paper
             III-B: everything is expressed in the first segment's frame).
         alignments: edges; only accepted ones between two nodes are used.
         loops: nodes that are loop segments; the tree runs through one only where nothing else connects.
@@ -83,11 +83,11 @@ def chain_pieces(
             before_from_node = edge.estimate.b_from_a if edge.target == before else edge.estimate.b_from_a.inverse()
             world_from[node] = world_from[before] @ before_from_node
             used.append(position)
-        pieces = tuple(sorted(world_from))
+        submodels = tuple(sorted(world_from))
         parts.append(
             ChainedPart(
-                pieces=pieces,
-                world_from_seg=tuple(world_from[piece] for piece in pieces),
+                submodels=submodels,
+                world_from_seg=tuple(world_from[submodel] for submodel in submodels),
                 edges=tuple(sorted(used)),
             )
         )

@@ -1,4 +1,4 @@
-"""Dense maps of one piece on disk, read one image at a time."""
+"""Dense maps of one submodel on disk, read one image at a time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from smust3r_colmap.geometry.camera import pointmap_from_depth
-from smust3r_colmap.products import SegmentPiece
+from smust3r_colmap.products import Submodel
 from smust3r_colmap.storage.run_directory import read_array, write_arrays
 
 _FILE = "maps.safetensors"
@@ -26,7 +26,7 @@ class ImageMaps:
 
 
 def write_maps(folder: Path, maps: Iterable[ImageMaps]) -> None:
-    """Write the maps of a piece, in the order of its images. Confidence is kept to three digits."""
+    """Write the maps of a submodel, in the order of its images. Confidence is kept to three digits."""
     arrays: dict[str, npt.NDArray[np.generic]] = {}
     for k, one in enumerate(maps):
         arrays[f"depth.{k}"] = one.depth.astype(np.float32)
@@ -36,19 +36,19 @@ def write_maps(folder: Path, maps: Iterable[ImageMaps]) -> None:
 
 
 class StoredMaps:
-    """``DenseMaps`` of a piece whose pointmaps are its depth maps seen by its cameras.
+    """``DenseMaps`` of a submodel whose pointmaps are its depth maps seen by its cameras.
 
     Args:
         folder: written by ``write_maps``.
-        piece: gives the pose and the intrinsics of each image.
+        submodel: gives the pose and the intrinsics of each image.
     """
 
-    def __init__(self, folder: Path, piece: SegmentPiece) -> None:
+    def __init__(self, folder: Path, submodel: Submodel) -> None:
         self._path = folder / _FILE
-        self._piece = piece
+        self._submodel = submodel
 
     def __len__(self) -> int:
-        return len(self._piece.images)
+        return len(self._submodel.images)
 
     def depth(self, k: int) -> npt.NDArray[np.float32]:
         """(H, W) z-depth in segment units, 0 where there is none."""
@@ -66,21 +66,21 @@ class StoredMaps:
         """(H, W, 3) in the segment frame, NaN where there is no depth."""
         depth = self.depth(k)
         height, width = depth.shape
-        intrinsics = self._piece.intrinsics[k].resized(width, height)
-        return pointmap_from_depth(depth, intrinsics, self._piece.seg_from_cam[k])
+        intrinsics = self._submodel.intrinsics[k].resized(width, height)
+        return pointmap_from_depth(depth, intrinsics, self._submodel.seg_from_cam[k])
 
 
 class EmptyMaps:
-    """``DenseMaps`` without a single pixel of depth, for a piece whose maps nobody needs or that got none.
+    """``DenseMaps`` without a single pixel of depth, for a submodel whose maps nobody needs or that got none.
 
     Args:
-        piece: gives the number and the shape of the images.
+        submodel: gives the number and the shape of the images.
         longer_side: of each map, in pixels; smaller images keep their size.
     """
 
-    def __init__(self, piece: SegmentPiece, *, longer_side: int) -> None:
+    def __init__(self, submodel: Submodel, *, longer_side: int) -> None:
         self._shapes = []
-        for intrinsics in piece.intrinsics:
+        for intrinsics in submodel.intrinsics:
             shrink = min(1.0, longer_side / max(intrinsics.width, intrinsics.height))
             self._shapes.append((max(1, round(intrinsics.height * shrink)), max(1, round(intrinsics.width * shrink))))
 

@@ -17,7 +17,7 @@
         loops/             every candidate for a loop, why it was taken or not, the loop segments
         tokens/            images as the MUSt3R network encoded them; the least recently used give way
         segments/0000/     mapping/  calibrated/  depth_0/  depth_1/ ..., or the prediction of a network
-        alignment/         edges between the pieces
+        alignment/         edges between the submodels
         stitched/          cameras as stitching placed them, one depth map per image
         track_pairs/       image pairs that the stitched geometry suggests for tracks
         refined/           0/model  1/model ...  database.db  figures.json
@@ -52,7 +52,7 @@ from smust3r_colmap.errors import RunDirectoryError, RunLockedError, StorageErro
 
 MODEL_FOLDER, DATABASE_FILE = "model", "database.db"
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Part of every key; a change of what a stage stores or computes raises it."""
 
 _LOCK_WAIT_S = 3.0

@@ -27,8 +27,8 @@ from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import (
     ImageCollection,
     Segment,
-    SegmentPiece,
     SegmentReconstruction,
+    Submodel,
     UnregisteredImage,
 )
 from smust3r_colmap.storage.run_directory import key_of
@@ -63,16 +63,16 @@ _FALSE_LOOPS, _DESCRIPTORS, _CHAIN, _SEGMENT, _IMAGE = range(5)
 RAYS_ACROSS = (8, 6)
 """Columns and rows of the rays by which a rigid camera is fitted to a warped scene."""
 MIN_IMAGES = 2
-"""Of a piece; one image has no baseline."""
+"""Of a submodel; one image has no baseline."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SimulatedGeometry:
-    """All errors of one piece but those of single pixels, with what they are errors of.
+    """All errors of one submodel but those of single pixels, with what they are errors of.
 
     Args:
         seg_from_world: (N, 4, 4) the similarity by which image k's surroundings were put into the segment,
-            before the warp; all equal in a piece that does not bend.
+            before the warp; all equal in a submodel that does not bend.
         warp: (4, 4) of the segment frame, the identity where none was asked for.
         focal_factor: estimated over true focal length.
         smooth: (N, M) coefficients of the smooth depth error.
@@ -92,33 +92,33 @@ class SimulatedGeometry:
 
 
 class OracleMaps:
-    """``DenseMaps`` of one piece, made when they are read; only the last image is kept.
+    """``DenseMaps`` of one submodel, made when they are read; only the last image is kept.
 
     Args:
         truth: what is simulated from.
-        piece: whose maps these are.
+        submodel: whose maps these are.
         geometry: its errors.
         settings: the errors of pixels.
-        seed_words: of the random numbers of this piece.
+        seed_words: of the random numbers of this submodel.
     """
 
     def __init__(
         self,
         truth: TrueScene,
-        piece: SegmentPiece,
+        submodel: Submodel,
         geometry: SimulatedGeometry,
         settings: OracleSettings,
         seed_words: Sequence[int],
     ) -> None:
-        self.piece, self.geometry = piece, geometry
+        self.submodel, self.geometry = submodel, geometry
         self._truth, self._settings, self._seed_words = truth, settings, tuple(seed_words)
         self._last: tuple[int, _SimulatedMaps] | None = None
 
     def __len__(self) -> int:
-        return len(self.piece.images)
+        return len(self.submodel.images)
 
     def pointmap_seg(self, k: int) -> Float32Array:
-        """(H, W, 3): the depth seen by the piece's camera, or the warped points where a warp was asked for."""
+        """(H, W, 3): the depth seen by the submodel's camera, or the warped points where a warp was asked for."""
         pointmap_seg: Float32Array = self._maps(k).pointmap_seg.copy()
         return pointmap_seg
 
@@ -134,7 +134,7 @@ class OracleMaps:
 
     def rgb(self, k: int) -> npt.NDArray[np.uint8]:
         """(H, W, 3) the true image."""
-        rgb: npt.NDArray[np.uint8] = self._truth.rgb(self.piece.images[k]).copy()
+        rgb: npt.NDArray[np.uint8] = self._truth.rgb(self.submodel.images[k]).copy()
         return rgb
 
     def true_cameras(self, images: Sequence[int]) -> FloatArray:
@@ -143,24 +143,24 @@ class OracleMaps:
 
     def _maps(self, k: int) -> _SimulatedMaps:
         if not 0 <= k < len(self):
-            raise IndexError(f"piece {self.piece.name}: image {k} of {len(self)}")
+            raise IndexError(f"submodel {self.submodel.name}: image {k} of {len(self)}")
         last = self._last
         if last is None or last[0] != k:
             last = self._last = (k, self._simulate(k))
         return last[1]
 
     def _simulate(self, k: int) -> _SimulatedMaps:
-        true_depth = self._truth.depth(self.piece.images[k])
+        true_depth = self._truth.depth(self.submodel.images[k])
         height, width = true_depth.shape
         rng = np.random.default_rng((*self._seed_words, _IMAGE, k))
         error = depth_error(height, width, self.geometry.smooth[k], self._settings, rng)
         confidence = confidence_of(error.known, self._settings.confidence_noise, rng)
         depth = self._segment_depth(k, true_depth, error)
-        intrinsics = self.piece.intrinsics[k].resized(width, height)
+        intrinsics = self.submodel.intrinsics[k].resized(width, height)
         if self.geometry.is_warped:
             depth, pointmap = self._warped(k, depth, intrinsics)
         else:
-            pointmap = pointmap_from_depth(depth, intrinsics, self.piece.seg_from_cam[k])
+            pointmap = pointmap_from_depth(depth, intrinsics, self.submodel.seg_from_cam[k])
         confidence[depth <= 0] = 1.0
         return _SimulatedMaps(depth=depth, pointmap_seg=pointmap, confidence=confidence)
 
@@ -171,10 +171,10 @@ class OracleMaps:
 
     def _warped(self, k: int, depth: Float32Array, intrinsics: Intrinsics) -> tuple[Float32Array, Float32Array]:
         """Depth and pointmap after the warp: where the points go, and how deep the fitted camera sees them."""
-        camera = self._truth.world_from_cam[self.piece.images[k]]
+        camera = self._truth.world_from_cam[self.submodel.images[k]]
         unwarped = _rigid_parts(self.geometry.seg_from_world[k] @ homogeneous(camera))
         points = warped_points(self.geometry.warp, pointmap_from_depth(depth, intrinsics, unwarped).astype(np.float64))
-        cam_from_seg = invert_rigid(self.piece.seg_from_cam[k])
+        cam_from_seg = invert_rigid(self.submodel.seg_from_cam[k])
         z = points @ cam_from_seg[2, :3] + cam_from_seg[2, 3]
         seen = np.isfinite(z) & (z > 0)
         pointmap = np.where(seen[..., None], points, np.nan).astype(np.float32)
@@ -191,7 +191,7 @@ class _SimulatedMaps:
 class OracleBackbone:
     """``Backbone`` that knows the truth and disturbs it by stated amounts.
 
-    A segment gives one piece. A window comes out right up to its errors, and so does a loop segment
+    A segment gives one submodel. A window comes out right up to its errors, and so does a loop segment
     whose halves (the images before and after the largest gap in its numbers) share some surface. Halves
     that share none, or less than they seem to by a false loop, are laid onto each other as if they were
     one place, in a confident, plausible and wrong relative pose: the mistake of a network that is shown
@@ -225,7 +225,7 @@ class OracleBackbone:
         return descriptors
 
     def reconstruct(self, segments: Sequence[Segment], *, with_maps: Collection[int]) -> BackboneResult:
-        """All segments; see ``Backbone``. Every piece has maps, whatever ``with_maps``: unread they cost nothing."""
+        """All segments; see ``Backbone``. Every submodel has maps, whatever ``with_maps``: unread they cost nothing."""
         made = [self._segment(segment) for segment in segments]
         return BackboneResult(
             reconstructions=tuple(reconstruction for reconstruction, _ in made),
@@ -265,18 +265,18 @@ class OracleBackbone:
         if fails or len(images) < MIN_IMAGES:
             return self._nothing(segment), None
         geometry = self._geometry(segment, images, rng)
-        piece = self._piece(segment, images, geometry)
+        submodel = self._submodel(segment, images, geometry)
         reconstruction = SegmentReconstruction(
             segment=segment.index,
-            pieces=(piece,),
+            submodels=(submodel,),
             unregistered=tuple(
                 UnregisteredImage(image=image, reason="the oracle was told to drop images")
                 for image in sorted(set(segment.images) - set(images))
             ),
-            attempts=(piece.method,),
+            attempts=(submodel.method,),
             metric=self.metric,
         )
-        return reconstruction, OracleMaps(self.truth, piece, geometry, self.settings, seed_words)
+        return reconstruction, OracleMaps(self.truth, submodel, geometry, self.settings, seed_words)
 
     def _seed_words(self, segment: Segment) -> tuple[int, ...]:
         """What the random numbers of a segment start from: the seed, its images and its kind, not its index."""
@@ -287,7 +287,7 @@ class OracleBackbone:
         reason = "the oracle was told to fail segments"
         return SegmentReconstruction(
             segment=segment.index,
-            pieces=(),
+            submodels=(),
             unregistered=tuple(UnregisteredImage(image=image, reason=reason) for image in segment.images),
             attempts=(reason,),
             metric=self.metric,
@@ -325,7 +325,7 @@ class OracleBackbone:
             mislaid=mislaid,
         )
 
-    def _piece(self, segment: Segment, images: tuple[int, ...], geometry: SimulatedGeometry) -> SegmentPiece:
+    def _submodel(self, segment: Segment, images: tuple[int, ...], geometry: SimulatedGeometry) -> Submodel:
         cameras = homogeneous(self.truth.world_from_cam[list(images)])
         seg_from_cam = _rigid_parts(geometry.seg_from_world @ cameras)
         sizes = [(self.collection.images[image].width, self.collection.images[image].height) for image in images]
@@ -333,9 +333,9 @@ class OracleBackbone:
         if geometry.is_warped:
             rays_cam = estimated[sizes[0]].resized(*RAYS_ACROSS).rays_cam(pixel_centres(*RAYS_ACROSS))
             seg_from_cam = warped_cameras(geometry.warp, seg_from_cam, rays_cam)
-        return SegmentPiece(
+        return Submodel(
             segment=segment.index,
-            piece=0,
+            submodel=0,
             images=images,
             seg_from_cam=seg_from_cam,
             intrinsics=tuple(estimated[size] for size in sizes),
@@ -397,14 +397,14 @@ def _rigid_parts(b_from_cam: FloatArray) -> FloatArray:
 # ------------------------------------------------------------------------------- scoring
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrueRelation:
-    """What an alignment of two pieces should find.
+    """What an alignment of two submodels should find.
 
     Args:
         target_from_source: (4, 4) homogeneous, the last entry 1; for ``from_matrix`` of the transform groups,
-            a similarity unless a piece is warped.
+            a similarity unless a submodel is warped.
         num_shared: images on which it rests.
         spread_rotation_deg, spread_log_scale, spread_position: by how much the images differ about it (rms),
-            the position in units of the target; zero between pieces that do not bend. No alignment can be
+            the position in units of the target; zero between submodels that do not bend. No alignment can be
             told right from wrong below these.
     """
 
@@ -416,31 +416,32 @@ class TrueRelation:
 
 
 def oracle_maps(result: BackboneResult) -> tuple[OracleMaps, ...]:
-    """The maps of all pieces of a result of the oracle, with the errors that were made.
+    """The maps of all submodels of a result of the oracle, with the errors that were made.
 
     Raises:
         TypeError: another backbone made it.
     """
     maps = tuple(one for one in result.dense if isinstance(one, OracleMaps))
     if len(maps) < len(result.dense):
-        raise TypeError(f"{len(result.dense) - len(maps)} of {len(result.dense)} pieces were not made by the oracle")
+        raise TypeError(f"{len(result.dense) - len(maps)} of {len(result.dense)} submodels were not made by the oracle")
     return maps
 
 
 def true_relation(target: OracleMaps, source: OracleMaps) -> TrueRelation:
-    """The mean over the shared images of ``target_from_source``, as the simulation put each into both pieces.
+    """The mean over the shared images of ``target_from_source``, as the simulation put each into both submodels.
 
-    Of a mislaid loop segment it is the relation of the half that the pieces share, which an alignment
+    Of a mislaid loop segment it is the relation of the half that the submodels share, which an alignment
     finds; the mistake lies between the halves (``OracleMaps.geometry.mislaid``).
 
     Raises:
-        DegenerateAlignmentError: the pieces share no image.
+        DegenerateAlignmentError: the submodels share no image.
     """
-    shared = sorted(set(target.piece.images) & set(source.piece.images))
+    shared = sorted(set(target.submodel.images) & set(source.submodel.images))
     if not shared:
-        raise DegenerateAlignmentError(f"pieces {target.piece.name} and {source.piece.name} share no image")
+        raise DegenerateAlignmentError(f"submodels {target.submodel.name} and {source.submodel.name} share no image")
     target_from_world, source_from_world = (
-        maps.geometry.seg_from_world[[maps.piece.images.index(image) for image in shared]] for maps in (target, source)
+        maps.geometry.seg_from_world[[maps.submodel.images.index(image) for image in shared]]
+        for maps in (target, source)
     )
     relations = target_from_world @ np.linalg.inv(source_from_world)
     centres_source = (source_from_world @ homogeneous(source.true_cameras(shared)))[:, :3, 3:]

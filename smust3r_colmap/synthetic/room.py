@@ -310,7 +310,7 @@ def _hit_box(box: int, centre: Float32Array, inverse: Float32Array, depth: Float
 
 
 def _windows(world_from_cam: FloatArray, intrinsics: Intrinsics) -> Iterator[tuple[int, tuple[slice, slice]]]:
-    """Each piece of furniture in view, with the rows and columns that it can cover."""
+    """Each submodel of furniture in view, with the rows and columns that it can cover."""
     fx, fy, cx, cy = intrinsics.params
     size = (intrinsics.width, intrinsics.height)
     corners_cam = (_CORNERS - world_from_cam[:, 3]) @ world_from_cam[:, :3]

@@ -104,7 +104,7 @@ class Report:
                 f"{self.model}: {_figures_text(self.figures, which)}",
                 *(f"  {kind}: {place}" for kind, place in self.beside.items()),
                 "",
-                *(findings or ["Nothing to remark."]),
+                *(findings or ["Nothing to note."]),
                 "",
                 *_readers_text(self.verdicts),
                 "",

@@ -1,4 +1,4 @@
-"""Sim(3) and SE(3) between pieces from the cameras of their shared images."""
+"""Sim(3) and SE(3) between submodels from the cameras of their shared images."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from helpers.scenes import make_piece, rotation_about_y, some_sim3, walk
+from helpers.scenes import make_submodel, rotation_about_y, some_sim3, walk
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.alignment.from_poses import align_poses
@@ -17,15 +17,15 @@ from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3
-from smust3r_colmap.products import SegmentPiece
+from smust3r_colmap.products import Submodel
 
 DEPTH = 8.0
 """Of the scene before the cameras, in world units."""
 
 
-def piece_of(world_from_cam: FloatArray, seg_from_world: Sim3, *, segment: int = 0) -> SegmentPiece:
+def submodel_of(world_from_cam: FloatArray, seg_from_world: Sim3, *, segment: int = 0) -> Submodel:
     images = tuple(range(len(world_from_cam)))
-    return make_piece(world_from_cam, images, np.zeros((0, 3)), seg_from_world, segment=segment, with_tracks=False)
+    return make_submodel(world_from_cam, images, np.zeros((0, 3)), seg_from_world, segment=segment, with_tracks=False)
 
 
 def disturbed(poses: FloatArray, rng: np.random.Generator, *, centre: float = 0.0, turn_deg: float = 0.0) -> FloatArray:
@@ -58,8 +58,8 @@ def aligned(
     kernel: RobustKernel = "cauchy",
 ) -> tuple[float, float]:
     """Degrees and percent of scale that the estimate is off."""
-    target = piece_of(target_poses, Sim3.identity())
-    source = piece_of(source_poses, target_from_source.inverse(), segment=1)
+    target = submodel_of(target_poses, Sim3.identity())
+    source = submodel_of(source_poses, target_from_source.inverse(), segment=1)
     found = align_poses(target, source, depth_target=DEPTH, kernel=kernel).estimate.b_from_a
     assert isinstance(found, Sim3)
     return errors(found, target_from_source)
@@ -75,7 +75,7 @@ def test_exact_cameras_give_the_exact_similarity(kernel: RobustKernel, num_image
     target_from_world, source_from_world = some_sim3(rng), some_sim3(rng)
     depth = DEPTH * float(target_from_world.scale)
     fit = align_poses(
-        piece_of(poses, target_from_world), piece_of(poses, source_from_world), depth_target=depth, kernel=kernel
+        submodel_of(poses, target_from_world), submodel_of(poses, source_from_world), depth_target=depth, kernel=kernel
     )
     true = target_from_world @ source_from_world.inverse()
     np.testing.assert_allclose(fit.estimate.b_from_a.matrix, true.matrix, rtol=1e-9, atol=1e-9)
@@ -89,7 +89,7 @@ def test_exact_cameras_give_the_exact_rigid_motion(num_images: int) -> None:
     rng = np.random.default_rng(3)
     true = replace(some_sim3(rng), scale=np.array(1.0))
     poses = walk(num_images)
-    fit = align_poses(piece_of(poses, true), piece_of(poses, Sim3.identity()), depth_target=DEPTH, group="se3")
+    fit = align_poses(submodel_of(poses, true), submodel_of(poses, Sim3.identity()), depth_target=DEPTH, group="se3")
     assert isinstance(fit.estimate.b_from_a, SE3)
     np.testing.assert_allclose(fit.estimate.b_from_a.matrix, true.matrix, atol=1e-12)
     assert fit.estimate.information.shape == (6, 6)
@@ -99,8 +99,8 @@ def test_exact_cameras_give_the_exact_rigid_motion(num_images: int) -> None:
 def test_only_shared_images_count() -> None:
     rng = np.random.default_rng(5)
     poses, true = walk(20), some_sim3(rng)
-    target = make_piece(poses, tuple(range(12)), np.zeros((0, 3)), Sim3.identity(), with_tracks=False)
-    source = make_piece(poses, tuple(range(7, 20)), np.zeros((0, 3)), true.inverse(), with_tracks=False)
+    target = make_submodel(poses, tuple(range(12)), np.zeros((0, 3)), Sim3.identity(), with_tracks=False)
+    source = make_submodel(poses, tuple(range(7, 20)), np.zeros((0, 3)), true.inverse(), with_tracks=False)
     fit = align_poses(target, source, depth_target=DEPTH)
     assert fit.num_correspondences == 5
     np.testing.assert_allclose(fit.estimate.b_from_a.matrix, true.matrix, atol=1e-10)
@@ -138,8 +138,8 @@ def test_scale_has_no_bias_in_either_direction() -> None:
     for seed in range(40):
         rng = np.random.default_rng(seed)
         poses = straight_walk(12)  # spread 1.04
-        target = piece_of(disturbed(poses, rng, centre=0.12, turn_deg=0.1), Sim3.identity())
-        source = piece_of(disturbed(poses, rng, centre=0.12, turn_deg=0.1), Sim3.identity())
+        target = submodel_of(disturbed(poses, rng, centre=0.12, turn_deg=0.1), Sim3.identity())
+        source = submodel_of(disturbed(poses, rng, centre=0.12, turn_deg=0.1), Sim3.identity())
         found = align_poses(target, source, depth_target=DEPTH).estimate.b_from_a
         assert isinstance(found, Sim3)
         logs.append(np.log(float(found.scale)))
@@ -154,8 +154,8 @@ def test_information_matches_the_scatter_of_the_estimates() -> None:
     for seed in range(40):
         rng = np.random.default_rng(seed)
         poses = walk(30)
-        target = piece_of(disturbed(poses, rng, centre=0.02, turn_deg=0.2), true)
-        source = piece_of(disturbed(poses, rng, centre=0.02, turn_deg=0.2), Sim3.identity())
+        target = submodel_of(disturbed(poses, rng, centre=0.02, turn_deg=0.2), true)
+        source = submodel_of(disturbed(poses, rng, centre=0.02, turn_deg=0.2), Sim3.identity())
         estimate = align_poses(target, source, depth_target=2 * DEPTH).estimate
         assert isinstance(estimate.b_from_a, Sim3)
         delta = (estimate.b_from_a.inverse() @ true).log()
@@ -201,7 +201,7 @@ def test_wrong_cameras_are_no_inliers() -> None:
     source = disturbed(poses, rng, centre=0.004, turn_deg=0.05)
     source[[3, 4], :, 3] += [0.0, 1.0, 0.0]
     source[[17], :, :3] @= rotation_about_y(8)
-    fit = align_poses(piece_of(poses, Sim3.identity()), piece_of(source, Sim3.identity()), depth_target=DEPTH)
+    fit = align_poses(submodel_of(poses, Sim3.identity()), submodel_of(source, Sim3.identity()), depth_target=DEPTH)
     assert 24 <= fit.estimate.num_inliers <= 27
     assert 0.0001 < fit.relative_residual < 0.002
     assert 0.0001 < fit.estimate.rms < 0.002, "of the inliers"
@@ -227,9 +227,9 @@ def test_nothing_has_a_unit(factor: float) -> None:
     poses = walk(20)
     target, source = disturbed(poses, rng, centre=0.01, turn_deg=0.3), disturbed(poses, rng, centre=0.01, turn_deg=0.3)
     zoom = Sim3(scale=np.array(factor), rotation=np.eye(3), translation=np.array([5.0, 6.0, 7.0]) * factor)
-    plain = align_poses(piece_of(target, Sim3.identity()), piece_of(source, Sim3.identity()), depth_target=DEPTH)
-    one = align_poses(piece_of(target, zoom), piece_of(source, Sim3.identity()), depth_target=DEPTH * factor)
-    other = align_poses(piece_of(target, Sim3.identity()), piece_of(source, zoom), depth_target=DEPTH)
+    plain = align_poses(submodel_of(target, Sim3.identity()), submodel_of(source, Sim3.identity()), depth_target=DEPTH)
+    one = align_poses(submodel_of(target, zoom), submodel_of(source, Sim3.identity()), depth_target=DEPTH * factor)
+    other = align_poses(submodel_of(target, Sim3.identity()), submodel_of(source, zoom), depth_target=DEPTH)
     assert isinstance(plain.estimate.b_from_a, Sim3)
     np.testing.assert_allclose(one.estimate.b_from_a.matrix, (zoom @ plain.estimate.b_from_a).matrix, rtol=1e-6)
     np.testing.assert_allclose(
@@ -245,8 +245,8 @@ def test_nothing_has_a_unit(factor: float) -> None:
 def refused(target: FloatArray, source: FloatArray, match: str, *, group: Literal["sim3", "se3"] = "sim3") -> None:
     with pytest.raises(DegenerateAlignmentError, match=match):
         align_poses(
-            piece_of(target, Sim3.identity()),
-            piece_of(source, Sim3.identity(), segment=1),
+            submodel_of(target, Sim3.identity()),
+            submodel_of(source, Sim3.identity(), segment=1),
             depth_target=DEPTH,
             group=group,
         )
@@ -254,18 +254,18 @@ def refused(target: FloatArray, source: FloatArray, match: str, *, group: Litera
 
 def test_one_common_camera_leaves_the_scale_free_and_is_named() -> None:
     poses = walk(9)
-    target = make_piece(poses, (1, 2, 5), np.zeros((0, 3)), Sim3.identity(), with_tracks=False)
-    source = make_piece(poses, (5, 7, 8), np.zeros((0, 3)), Sim3.identity(), segment=1, with_tracks=False)
-    with pytest.raises(DegenerateAlignmentError, match=r"pieces 0 and 1 share one camera \(image 5\).*scale"):
+    target = make_submodel(poses, (1, 2, 5), np.zeros((0, 3)), Sim3.identity(), with_tracks=False)
+    source = make_submodel(poses, (5, 7, 8), np.zeros((0, 3)), Sim3.identity(), segment=1, with_tracks=False)
+    with pytest.raises(DegenerateAlignmentError, match=r"submodels 0 and 1 share one camera \(image 5\).*scale"):
         align_poses(target, source, depth_target=DEPTH)
 
 
 @pytest.mark.parametrize("group", ["sim3", "se3"])
-def test_pieces_without_a_common_image_are_refused(group: Literal["sim3", "se3"]) -> None:
+def test_submodels_without_a_common_image_are_refused(group: Literal["sim3", "se3"]) -> None:
     poses = walk(4)
-    target = make_piece(poses, (0, 1), np.zeros((0, 3)), Sim3.identity(), with_tracks=False)
-    source = make_piece(poses, (2, 3), np.zeros((0, 3)), Sim3.identity(), segment=1, with_tracks=False)
-    with pytest.raises(DegenerateAlignmentError, match="pieces 0 and 1 share no image"):
+    target = make_submodel(poses, (0, 1), np.zeros((0, 3)), Sim3.identity(), with_tracks=False)
+    source = make_submodel(poses, (2, 3), np.zeros((0, 3)), Sim3.identity(), segment=1, with_tracks=False)
+    with pytest.raises(DegenerateAlignmentError, match="submodels 0 and 1 share no image"):
         align_poses(target, source, depth_target=DEPTH, group=group)
 
 
@@ -296,7 +296,7 @@ def test_standing_camera_of_a_metric_backbone_is_aligned() -> None:
     poses[:, :, 3] = 0
     target, source = (disturbed(poses, rng, centre=0.01, turn_deg=0.1) for _ in range(2))
     fit = align_poses(
-        piece_of(target, Sim3.identity()), piece_of(source, Sim3.identity()), depth_target=DEPTH, group="se3"
+        submodel_of(target, Sim3.identity()), submodel_of(source, Sim3.identity()), depth_target=DEPTH, group="se3"
     )
     moved = fit.estimate.b_from_a.log()
     assert 1e-4 < np.linalg.norm(moved[:3]) < 0.02
@@ -315,6 +315,6 @@ def test_a_slow_walk_well_above_its_noise_is_not_refused() -> None:
 
 @pytest.mark.parametrize("depth", [0.0, -1.0, np.nan, np.inf])
 def test_a_depth_must_be_positive(depth: float) -> None:
-    piece = piece_of(walk(3), Sim3.identity())
-    with pytest.raises(ValueError, match=re.escape(f"piece 0: median depth {depth}, needed a positive number")):
-        align_poses(piece, piece, depth_target=depth)
+    submodel = submodel_of(walk(3), Sim3.identity())
+    with pytest.raises(ValueError, match=re.escape(f"submodel 0: median depth {depth}, needed a positive number")):
+        align_poses(submodel, submodel, depth_target=depth)

@@ -2,15 +2,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.scenes import make_piece, points_ahead, rotation_about_y, some_sim3, walk
+from helpers.scenes import make_submodel, points_ahead, rotation_about_y, some_sim3, walk
 
 from smust3r_colmap.alignment.from_tracks import point_depths
-from smust3r_colmap.alignment.pairwise import align_pieces, candidate_pairs, disagreement_sigmas
+from smust3r_colmap.alignment.pairwise import align_submodels, candidate_pairs, disagreement_sigmas
 from smust3r_colmap.config import AlignmentConfig, AlignmentEdges, TransformGroup
 from smust3r_colmap.geometry.affine3 import Affine3
 from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.sim3 import Sim3
-from smust3r_colmap.products import Edges, FeatureLinks, SegmentPiece
+from smust3r_colmap.products import Edges, FeatureLinks, Submodel
 from smust3r_colmap.storage.alignments import read_edges, write_edges
 
 
@@ -22,35 +22,33 @@ class Counter:
         self.count += more
 
 
-def two_pieces(
+def two_submodels(
     images_a: range, images_b: range, *, noise: float = 0.0, seed: int = 0
-) -> tuple[SegmentPiece, SegmentPiece, Sim3]:
+) -> tuple[Submodel, Submodel, Sim3]:
     """Two views of one world in frames of their own, and the true a_from_b."""
     rng = np.random.default_rng(seed)
     world_from_cam, points = walk(20), points_ahead(400, rng)
     a_from_world, b_from_world = some_sim3(rng), some_sim3(rng)
-    a = make_piece(world_from_cam, tuple(images_a), points, a_from_world)
+    a = make_submodel(world_from_cam, tuple(images_a), points, a_from_world)
     noisy = points * (1 + noise * rng.normal(size=(len(points), 1)))
-    b = make_piece(world_from_cam, tuple(images_b), noisy, b_from_world, segment=1)
+    b = make_submodel(world_from_cam, tuple(images_b), noisy, b_from_world, segment=1)
     return a, b, a_from_world @ b_from_world.inverse()
 
 
-def align(
-    a: SegmentPiece, b: SegmentPiece, links: FeatureLinks | None = None, *, edges: AlignmentEdges = "points"
-) -> Edges:
+def align(a: Submodel, b: Submodel, links: FeatureLinks | None = None, *, edges: AlignmentEdges = "points") -> Edges:
     settings = AlignmentConfig(alignment_edges=edges)
-    return align_pieces([a, b], [], links, settings, seed=0, advance=Counter())
+    return align_submodels([a, b], [], links, settings, seed=0, advance=Counter())
 
 
-def test_pieces_that_share_images_are_joined_by_their_tracks() -> None:
-    a, b, a_from_b = two_pieces(range(12), range(6, 18))
+def test_submodels_that_share_images_are_joined_by_their_tracks() -> None:
+    a, b, a_from_b = two_submodels(range(12), range(6, 18))
     (found,) = align(a, b).alignments
     assert (found.accepted, found.evidence) == (True, "tracks")
     np.testing.assert_allclose(found.estimate.b_from_a.matrix, a_from_b.matrix, rtol=1e-6, atol=1e-6)
 
 
-def test_pieces_without_shared_images_are_joined_by_matches() -> None:
-    a, b, a_from_b = two_pieces(range(9), range(9, 18))
+def test_submodels_without_shared_images_are_joined_by_matches() -> None:
+    a, b, a_from_b = two_submodels(range(9), range(9, 18))
     feature = np.arange(60)
     links = FeatureLinks(image_a=np.full(60, 8), feature_a=feature, image_b=np.full(60, 9), feature_b=feature)
     (found,) = align(a, b, links).alignments
@@ -59,7 +57,7 @@ def test_pieces_without_shared_images_are_joined_by_matches() -> None:
 
 
 def test_matches_count_in_both_directions() -> None:
-    a, b, a_from_b = two_pieces(range(9, 18), range(9))
+    a, b, a_from_b = two_submodels(range(9, 18), range(9))
     feature = np.arange(60)
     links = FeatureLinks(image_a=np.full(60, 8), feature_a=feature, image_b=np.full(60, 9), feature_b=feature)
     (found,) = align(a, b, links).alignments
@@ -68,7 +66,7 @@ def test_matches_count_in_both_directions() -> None:
 
 
 def test_too_few_matching_points_are_refused_with_their_number() -> None:
-    a, b, _ = two_pieces(range(9), range(9, 18))
+    a, b, _ = two_submodels(range(9), range(9, 18))
     feature = np.arange(8)
     links = FeatureLinks(image_a=np.full(8, 8), feature_a=feature, image_b=np.full(8, 9), feature_b=feature)
     (found,) = align(a, b, links).alignments
@@ -76,8 +74,8 @@ def test_too_few_matching_points_are_refused_with_their_number() -> None:
     assert found.reason == "8 matched points fit, needed 12"
 
 
-def test_pieces_with_nothing_in_common_are_reported() -> None:
-    a, b, _ = two_pieces(range(9), range(9, 18))
+def test_submodels_with_nothing_in_common_are_reported() -> None:
+    a, b, _ = two_submodels(range(9), range(9, 18))
     nothing = np.zeros(0, np.int64)
     edges = align(a, b, FeatureLinks(image_a=nothing, feature_a=nothing, image_b=nothing, feature_b=nothing))
     assert not edges.alignments
@@ -86,8 +84,8 @@ def test_pieces_with_nothing_in_common_are_reported() -> None:
     assert "0" in failure.reason
 
 
-def test_a_warped_piece_is_refused_by_its_residual() -> None:
-    a, b, _ = two_pieces(range(12), range(6, 18), noise=0.4)
+def test_a_warped_submodel_is_refused_by_its_residual() -> None:
+    a, b, _ = two_submodels(range(12), range(6, 18), noise=0.4)
     (found,) = align(a, b).alignments
     assert not found.accepted
     assert "of the depth, at most 0.05" in found.reason
@@ -95,12 +93,12 @@ def test_a_warped_piece_is_refused_by_its_residual() -> None:
 
 
 def test_points_that_fit_while_cameras_disagree_are_refused() -> None:
-    a, b, _ = two_pieces(range(12), range(6, 18))
+    a, b, _ = two_submodels(range(12), range(6, 18))
     turned = b.seg_from_cam.copy()
     turned[:, :, :3] = turned[:, :, :3] @ rotation_about_y(25.0)
-    wrong = SegmentPiece(
+    wrong = Submodel(
         segment=1,
-        piece=0,
+        submodel=0,
         images=b.images,
         seg_from_cam=turned,
         intrinsics=b.intrinsics,
@@ -113,18 +111,18 @@ def test_points_that_fit_while_cameras_disagree_are_refused() -> None:
     assert "shared cameras differ by 25.0 degrees" in found.reason
 
 
-def test_only_pieces_that_could_meet_are_tried() -> None:
+def test_only_submodels_that_could_meet_are_tried() -> None:
     world_from_cam, points = walk(20), points_ahead(20, np.random.default_rng(0))
 
-    def piece(images: range, segment: int) -> SegmentPiece:
-        return make_piece(world_from_cam, tuple(images), points, Sim3.identity(), segment=segment)
+    def submodel(images: range, segment: int) -> Submodel:
+        return make_submodel(world_from_cam, tuple(images), points, Sim3.identity(), segment=segment)
 
-    pieces = [piece(range(4), 0), piece(range(6, 10), 1), piece(range(12, 16), 2), piece(range(2, 6), 5)]
-    assert candidate_pairs(pieces) == ((0, 1), (0, 3), (1, 2))
+    submodels = [submodel(range(4), 0), submodel(range(6, 10), 1), submodel(range(12, 16), 2), submodel(range(2, 6), 5)]
+    assert candidate_pairs(submodels) == ((0, 1), (0, 3), (1, 2))
 
 
 def test_edges_come_back_from_disk_as_they_were(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    a, b, _ = two_pieces(range(12), range(6, 18))
+    a, b, _ = two_submodels(range(12), range(6, 18))
     edges = align(a, b, edges="both")
     write_edges(tmp_path, edges)
     back = read_edges(tmp_path)
@@ -137,7 +135,7 @@ def test_edges_come_back_from_disk_as_they_were(tmp_path) -> None:  # type: igno
 
 
 def test_shared_images_give_an_edge_from_points_and_one_from_cameras() -> None:
-    a, b, a_from_b = two_pieces(range(12), range(6, 18))
+    a, b, a_from_b = two_submodels(range(12), range(6, 18))
     points, poses = align(a, b, edges="both").alignments
     assert (points.evidence, poses.evidence) == ("tracks", "poses")
     assert points.accepted
@@ -149,7 +147,7 @@ def test_shared_images_give_an_edge_from_points_and_one_from_cameras() -> None:
 
 
 def test_cameras_that_deny_sound_points_are_refused() -> None:
-    a, b, _ = two_pieces(range(12), range(6, 18))
+    a, b, _ = two_submodels(range(12), range(6, 18))
     moved = b.seg_from_cam.copy()
     moved[:, :, 3] += 0.15 * float(np.median(point_depths(b))) * moved[:, :, 2]  # every camera steps ahead
     wrong = replace(b, seg_from_cam=moved)
@@ -160,7 +158,7 @@ def test_cameras_that_deny_sound_points_are_refused() -> None:
 
 
 def test_one_common_camera_gives_an_edge_from_points_only() -> None:
-    a, b, a_from_b = two_pieces(range(12), range(11, 18))
+    a, b, a_from_b = two_submodels(range(12), range(11, 18))
     edges = align(a, b, edges="both")
     (points,) = edges.alignments
     np.testing.assert_allclose(points.estimate.b_from_a.matrix, a_from_b.matrix, rtol=1e-6, atol=1e-6)
@@ -172,13 +170,18 @@ def test_one_common_camera_gives_an_edge_from_points_only() -> None:
 def test_two_loops_are_never_aligned_and_no_loop_by_its_number() -> None:
     world_from_cam, points = walk(20), points_ahead(20, np.random.default_rng(0))
 
-    def piece(images: tuple[int, ...], segment: int) -> SegmentPiece:
-        return make_piece(world_from_cam, images, points, Sim3.identity(), segment=segment)
+    def submodel(images: tuple[int, ...], segment: int) -> Submodel:
+        return make_submodel(world_from_cam, images, points, Sim3.identity(), segment=segment)
 
-    pieces = [piece(tuple(range(6)), 0), piece(tuple(range(12, 18)), 1), piece((2, 3, 14), 2), piece((3, 4, 15), 3)]
-    assert candidate_pairs(pieces, {2, 3}) == ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3))
-    lonely = piece((8, 9), 2)
-    assert candidate_pairs([*pieces[:2], lonely], {2}) == ((0, 1),)
+    submodels = [
+        submodel(tuple(range(6)), 0),
+        submodel(tuple(range(12, 18)), 1),
+        submodel((2, 3, 14), 2),
+        submodel((3, 4, 15), 3),
+    ]
+    assert candidate_pairs(submodels, {2, 3}) == ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3))
+    lonely = submodel((8, 9), 2)
+    assert candidate_pairs([*submodels[:2], lonely], {2}) == ((0, 1),)
 
 
 @pytest.mark.parametrize("group", ["sim3", "se3", "affine3", "sl4"])
@@ -186,10 +189,10 @@ def test_all_edges_of_a_run_are_in_its_group(group: TransformGroup) -> None:
     rng = np.random.default_rng(3)
     world_from_cam, points = walk(20), points_ahead(400, rng)
     turned = Sim3(scale=np.ones(()), rotation=rotation_about_y(30.0), translation=np.array([1.0, 2.0, 3.0]))
-    a = make_piece(world_from_cam, tuple(range(12)), points, Sim3.identity())
-    b = make_piece(world_from_cam, tuple(range(6, 18)), points, turned, segment=1)
+    a = make_submodel(world_from_cam, tuple(range(12)), points, Sim3.identity())
+    b = make_submodel(world_from_cam, tuple(range(6, 18)), points, turned, segment=1)
     settings = AlignmentConfig(transform_group=group)
-    found = align_pieces([a, b], [], None, settings, seed=0, advance=Counter()).alignments
+    found = align_submodels([a, b], [], None, settings, seed=0, advance=Counter()).alignments
     assert [edge.evidence for edge in found] == ["tracks", "poses"]
     for edge in found:
         assert edge.accepted, edge.reason
@@ -199,9 +202,9 @@ def test_all_edges_of_a_run_are_in_its_group(group: TransformGroup) -> None:
 
 
 def test_edges_a_stretched_half_turn_apart_deny_each_other() -> None:
-    a, b, _ = two_pieces(range(12), range(6, 18))
+    a, b, _ = two_submodels(range(12), range(6, 18))
     settings = AlignmentConfig(transform_group="affine3", alignment_edges="points")
-    (edge,) = align_pieces([a, b], [], None, settings, seed=0, advance=Counter()).alignments
+    (edge,) = align_submodels([a, b], [], None, settings, seed=0, advance=Counter()).alignments
     half_turn = Affine3.from_matrix(np.diag([-1.1, -0.9, 1.0, 1.0]))
     turned = replace(edge, estimate=replace(edge.estimate, b_from_a=edge.estimate.b_from_a @ half_turn))
     assert disagreement_sigmas(edge, edge) == pytest.approx(0.0, abs=1e-6)

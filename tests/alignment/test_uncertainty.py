@@ -7,7 +7,7 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 import pytest
-from helpers.scenes import make_piece, some_sim3, walk
+from helpers.scenes import make_submodel, some_sim3, walk
 
 from smust3r_colmap.alignment.uncertainty import (
     FLOOR,
@@ -170,7 +170,7 @@ def test_in_a_wider_group_the_known_directions_keep_what_is_known(
     np.testing.assert_allclose(inside.T @ wide @ inside, narrow, rtol=1e-6, atol=1e-7 * np.abs(narrow).max())
 
 
-def test_shear_between_pieces_related_by_a_similarity_is_vaguely_none() -> None:
+def test_shear_between_submodels_related_by_a_similarity_is_vaguely_none() -> None:
     group = GROUPS["affine3"]
     wide = honest(estimate_of(Sim3.identity(), some_information(7)), group=group, centre=np.zeros(3))
     shear = np.zeros((4, 4))
@@ -202,8 +202,8 @@ def test_information_must_fit_the_transform() -> None:
 # ---------------------------------------------------------------------------------- middle
 def test_middle_of_the_overlap_lies_before_the_shared_cameras() -> None:
     poses = walk(9, turn_deg=0.0)
-    piece = make_piece(poses, tuple(range(9)), np.zeros((0, 3)), Sim3.identity())
-    centre = overlap_centre(piece, {5, 6, 7, 100}, 4.0)
+    submodel = make_submodel(poses, tuple(range(9)), np.zeros((0, 3)), Sim3.identity())
+    centre = overlap_centre(submodel, {5, 6, 7, 100}, 4.0)
     np.testing.assert_allclose(centre, poses[6, :, 3] + [0, 0, 4], atol=0.1)
-    with pytest.raises(ValueError, match="piece 0 holds none of the 1 shared images"):
-        overlap_centre(piece, {100}, 4.0)
+    with pytest.raises(ValueError, match="submodel 0 holds none of the 1 shared images"):
+        overlap_centre(submodel, {100}, 4.0)

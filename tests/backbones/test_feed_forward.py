@@ -1,4 +1,4 @@
-"""From a network's predictions to pieces: what is kept, what is thrown out, and how a run goes on."""
+"""From a network's predictions to submodels: what is kept, what is thrown out, and how a run goes on."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class CountingNetwork:
     unregistered: tuple[UnregisteredImage, ...] = ()
     extra: tuple[PredictedImage, ...] = ()
     notes: tuple[str, ...] = ()
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     descriptors: npt.NDArray[np.float32] = field(default_factory=lambda: np.ones((NUM_IMAGES, 3), np.float32))
     asked: list[int] = field(default_factory=list)
     described: int = 0
@@ -104,7 +104,7 @@ class CountingNetwork:
             unregistered=self.unregistered,
             method="looked",
             notes=self.notes,
-            doubts=self.doubts,
+            warnings=self.warnings,
         )
 
 
@@ -130,19 +130,19 @@ def start(
 
 
 # ------------------------------------------------------------------------------ what comes back
-def test_a_prediction_comes_back_as_one_piece_with_its_maps(tmp_path: Path) -> None:
+def test_a_prediction_comes_back_as_one_submodel_with_its_maps(tmp_path: Path) -> None:
     result = start(tmp_path / "run", CountingNetwork(), WINDOW, LOOP)
     assert [one.segment for one in result.reconstructions] == [0, 1]
-    assert all(one.metric and not one.unregistered and not one.doubts for one in result.reconstructions)
+    assert all(one.metric and not one.unregistered and not one.warnings for one in result.reconstructions)
     assert (result.links, result.rejected, len(result.dense)) == (None, (), 2)
-    for segment, piece, maps in zip((WINDOW, LOOP), result.pieces, result.dense, strict=True):
-        assert piece.images == segment.images
-        assert (piece.method, piece.tracks) == ("looked", None)
+    for segment, submodel, maps in zip((WINDOW, LOOP), result.submodels, result.dense, strict=True):
+        assert submodel.images == segment.images
+        assert (submodel.method, submodel.tracks) == ("looked", None)
         assert len(maps) == 4
-        for k, image in enumerate(piece.images):
+        for k, image in enumerate(submodel.images):
             said = prediction_of(image)
-            np.testing.assert_array_equal(piece.seg_from_cam[k], said.seg_from_cam)
-            assert piece.intrinsics[k] == CAMERA
+            np.testing.assert_array_equal(submodel.seg_from_cam[k], said.seg_from_cam)
+            assert submodel.intrinsics[k] == CAMERA
             np.testing.assert_array_equal(maps.depth(k), said.maps.depth)
             np.testing.assert_allclose(maps.confidence(k), said.maps.confidence, rtol=1e-3)
             np.testing.assert_array_equal(maps.rgb(k), said.maps.rgb)
@@ -161,13 +161,13 @@ def test_notes_are_told_and_stand_among_the_attempts(tmp_path: Path) -> None:
 
 # ------------------------------------------------------------------------------ a second start
 def test_a_second_start_predicts_nothing_and_gives_the_same(tmp_path: Path) -> None:
-    first, second = CountingNetwork(doubts=("dark",)), CountingNetwork()
+    first, second = CountingNetwork(warnings=("dark",)), CountingNetwork()
     before = start(tmp_path / "run", first, WINDOW, LOOP)
     after = start(tmp_path / "run", second, WINDOW, LOOP)
     assert (first.asked, second.asked) == ([0, 1], [])
     assert before.dense_key == after.dense_key
-    assert after.reconstructions[0].doubts == ("dark",)
-    for one, other in zip(before.pieces, after.pieces, strict=True):
+    assert after.reconstructions[0].warnings == ("dark",)
+    for one, other in zip(before.submodels, after.submodels, strict=True):
         np.testing.assert_array_equal(one.seg_from_cam, other.seg_from_cam)
         assert (one.images, one.intrinsics, one.method) == (other.images, other.intrinsics, other.method)
 
@@ -182,7 +182,7 @@ def test_a_run_goes_on_where_it_was_stopped(tmp_path: Path) -> None:
     with pytest.raises(ReconstructionError, match="does not fit"):
         start(tmp_path / "run", FullCard(), WINDOW, LOOP)
     network = CountingNetwork()
-    assert len(start(tmp_path / "run", network, WINDOW, LOOP).pieces) == 2
+    assert len(start(tmp_path / "run", network, WINDOW, LOOP).submodels) == 2
     assert network.asked == [1]
 
 
@@ -247,7 +247,7 @@ def with_pose(change: Callable[[FloatArray], FloatArray]) -> Spoil:
 def test_a_camera_that_is_none_costs_its_image_only(tmp_path: Path, spoil: Spoil, reason: str) -> None:
     result = start(tmp_path / "run", CountingNetwork(spoils={2: spoil}))
     (reconstruction,) = result.reconstructions
-    assert reconstruction.pieces[0].images == (0, 1, 3)
+    assert reconstruction.submodels[0].images == (0, 1, 3)
     assert [one.image for one in reconstruction.unregistered] == [2]
     assert reason in reconstruction.unregistered[0].reason
     np.testing.assert_array_equal(result.dense[0].depth(2), prediction_of(3).maps.depth)
@@ -256,7 +256,7 @@ def test_a_camera_that_is_none_costs_its_image_only(tmp_path: Path, spoil: Spoil
 def test_an_image_of_which_nothing_is_said_is_unregistered(tmp_path: Path) -> None:
     network = CountingNetwork(silent=(1,), unregistered=(UnregisteredImage(image=3, reason="too dark"),))
     (reconstruction,) = start(tmp_path / "run", network).reconstructions
-    assert reconstruction.pieces[0].images == (0, 2)
+    assert reconstruction.submodels[0].images == (0, 2)
     assert {one.image: one.reason for one in reconstruction.unregistered} == {
         3: "too dark",
         1: "the network said nothing of it",
@@ -264,15 +264,15 @@ def test_an_image_of_which_nothing_is_said_is_unregistered(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("left", [1, 0])
-def test_fewer_than_two_cameras_give_no_piece(tmp_path: Path, left: int) -> None:
+def test_fewer_than_two_cameras_give_no_submodel(tmp_path: Path, left: int) -> None:
     spoils = {image: with_pose(lambda pose: pose * np.nan) for image in WINDOW.images[left:]}
-    result = start(tmp_path / "run", CountingNetwork(spoils=spoils, doubts=("dark",)))
+    result = start(tmp_path / "run", CountingNetwork(spoils=spoils, warnings=("dark",)))
     (reconstruction,) = result.reconstructions
-    assert (result.pieces, result.dense, reconstruction.doubts) == ((), (), ())
+    assert (result.submodels, result.dense, reconstruction.warnings) == ((), (), ())
     assert sorted(one.image for one in reconstruction.unregistered) == list(WINDOW.images)
     alone = [one for one in reconstruction.unregistered if "only 1 image" in one.reason]
     assert [one.image for one in alone] == ([0] if left else [])
-    assert start(tmp_path / "run", CountingNetwork()).pieces == ()
+    assert start(tmp_path / "run", CountingNetwork()).submodels == ()
 
 
 def test_depth_that_is_none_is_stored_as_zero_and_confidence_in_range(tmp_path: Path) -> None:
@@ -315,7 +315,7 @@ def test_depth_that_is_none_is_stored_as_zero_and_confidence_in_range(tmp_path: 
 def test_mistakes_of_an_adapter_are_named_and_not_kept(tmp_path: Path, network: CountingNetwork, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         start(tmp_path / "run", network)
-    assert start(tmp_path / "run", CountingNetwork()).pieces[0].images == WINDOW.images
+    assert start(tmp_path / "run", CountingNetwork()).submodels[0].images == WINDOW.images
 
 
 # ------------------------------------------------------------------------------ fingerprints
@@ -350,7 +350,7 @@ from helpers.room_network import RoomPredictor
 from smust3r_colmap.backbones.feed_forward import FeedForwardBackbone
 
 def make(context):
-    predictor = RoomPredictor(context.collection, doubts=context.options.get("doubts", ""))
+    predictor = RoomPredictor(context.collection, warnings=context.options.get("warnings", ""))
     return FeedForwardBackbone(predictor, context.collection, context.run, context.reporter)
 """
 
@@ -390,7 +390,7 @@ def test_a_whole_run_closes_its_loop_and_goes_on_for_nothing(room: Path, tmp_pat
 
 
 def test_doubts_make_a_run_weak_and_leave_its_model(room: Path, tmp_path: Path) -> None:
-    summary = run(room, tmp_path / "out", replace(CONFIG, backbone_options="doubts=all is fog"))
+    summary = run(room, tmp_path / "out", replace(CONFIG, backbone_options="warnings=all is fog"))
     assert summary.exit_code == 3
     assert summary.weak_reasons == (
         "the geometry of 9 of 9 segments should not be trusted, such as segment 0: all is fog",

@@ -215,13 +215,13 @@ def test_cameras_and_depth_come_through_as_they_are(
     assert (backbone.name, backbone.metric, backbone.has_tracks) == ("vggt", False, False)
     result = backbone.reconstruct([Segment(index=0, images=(0, 1, 2))], with_maps=[0])
 
-    (piece,), (maps,) = result.pieces, result.dense
-    assert piece.images == (0, 1, 2)
+    (submodel,), (maps,) = result.submodels, result.dense
+    assert submodel.images == (0, 1, 2)
     for k, camera in enumerate(cameras):
         truth = relative_pose(room.world_from_cam, k, 0, UNIT_M)
-        np.testing.assert_allclose(piece.seg_from_cam[k], truth, atol=2e-6)
-        assert (piece.intrinsics[k].width, piece.intrinsics[k].height) == (camera.width, camera.height)
-        np.testing.assert_allclose(piece.intrinsics[k].params, camera.params, rtol=1e-5)
+        np.testing.assert_allclose(submodel.seg_from_cam[k], truth, atol=2e-6)
+        assert (submodel.intrinsics[k].width, submodel.intrinsics[k].height) == (camera.width, camera.height)
+        np.testing.assert_allclose(submodel.intrinsics[k].params, camera.params, rtol=1e-5)
         expected, seen = true_depth(room, k, camera, maps.depth(k).shape[0])
         np.testing.assert_array_equal(maps.depth(k) > 0, seen)
         np.testing.assert_allclose(maps.depth(k)[seen], expected[seen], rtol=2e-4)
@@ -315,8 +315,8 @@ def test_a_network_that_is_sure_of_nothing_is_doubted(
     collection = photographs(tmp_path / "images", room, [CAMERAS["landscape"]] * 3)
     room.confidence = 1.02
     result = backbone_of(collection, run, checkpoint).reconstruct([Segment(index=0, images=(0, 1, 2))], with_maps=[])
-    assert result.reconstructions[0].doubts == ("VGGT is sure of 0.0 % of the pixels only, 5 % are needed",)
-    assert len(result.pieces) == 1
+    assert result.reconstructions[0].warnings == ("VGGT is sure of 0.0 % of the pixels only, 5 % are needed",)
+    assert len(result.submodels) == 1
 
 
 def test_an_image_without_camera_or_file_is_left_out(
@@ -329,7 +329,7 @@ def test_an_image_without_camera_or_file_is_left_out(
         [Segment(index=0, images=tuple(range(5)))], with_maps=[]
     )
     (reconstruction,) = result.reconstructions
-    assert reconstruction.pieces[0].images == (0, 1, 4)
+    assert reconstruction.submodels[0].images == (0, 1, 4)
     reasons = {one.image: one.reason for one in reconstruction.unregistered}
     assert "camera is not finite" in reasons[2]
     assert "03.png: cannot be read" in reasons[3]
@@ -358,7 +358,7 @@ def test_a_segment_too_large_for_the_card_says_the_way_out_and_is_not_kept(
     with pytest.raises(ReconstructionError, match=r"segment 3: 2 images of 140x112 px do not fit.*--segment-length"):
         backbone.reconstruct([segment], with_maps=[])
     room.too_large = False
-    assert len(backbone.reconstruct([segment], with_maps=[]).pieces) == 1
+    assert len(backbone.reconstruct([segment], with_maps=[]).submodels) == 1
 
 
 # ------------------------------------------------------------------------------ options and weights

@@ -32,8 +32,7 @@ from smust3r_colmap.execution.progress import QuietReporter
 from smust3r_colmap.execution.stage_clock import StageClock
 from smust3r_colmap.exporters import registry as exports
 from smust3r_colmap.exporters.dense_workspace import DenseReport
-from smust3r_colmap.exporters.registry import FORMATS, FormatSettings, write_where_possible
-from smust3r_colmap.products import Written
+from smust3r_colmap.exporters.registry import FORMATS, FormatSettings, Written, write_where_possible
 from smust3r_colmap.storage.finished_run import FinishedRun, open_finished
 from smust3r_colmap.storage.run_directory import RunDirectory
 
@@ -76,7 +75,7 @@ def test_text_glb_and_trajectory_are_added_on_demand(run: Path) -> None:
         export(run, "--format", "sparse", "--text")
 
 
-def test_a_trainer_folder_is_made_with_masks_scales_and_remarks(
+def test_a_trainer_folder_is_made_with_masks_scales_and_notes(
     run: Path, finished_example: Example, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     move_a_point_far_away(run)
@@ -286,16 +285,16 @@ def test_a_format_that_fails_costs_itself_only_and_remarks_are_collected(
         raise MissingDependencyError("install open3d")
 
     replace_writer(monkeypatch, "mesh", fail)
-    replace_writer(monkeypatch, "trainer", lambda *_: Written(name="trainer", remarks=("3 cameras left out",)))
+    replace_writer(monkeypatch, "trainer", lambda *_: Written(name="trainer", notes=("3 cameras left out",)))
     clock = StageClock(QuietReporter(sys.stderr))
     with RunDirectory(run) as held:
         outputs = write_where_possible(open_finished(held), ("mesh", "trainer", "ply"), FormatSettings(), clock)
     assert [(one.name, one.reason) for one in outputs.missing] == [("mesh", "install open3d")]
-    assert outputs.remarks == ("trainer: 3 cameras left out",)
+    assert outputs.notes == ("trainer: 3 cameras left out",)
     assert [stage.name for stage in clock.stages] == ["mesh", "trainer", "ply"]
-    summary = replace(GOOD, remarks=outputs.remarks)
-    assert summary.to_json_dict()["remarks"] == list(outputs.remarks)
-    assert outputs.remarks[0] in summary.render_text()
+    summary = replace(GOOD, notes=outputs.notes)
+    assert summary.to_json_dict()["notes"] == list(outputs.notes)
+    assert outputs.notes[0] in summary.render_text()
     assert summary.exit_code == 0
 
 
@@ -314,7 +313,7 @@ def test_dense_says_what_is_not_there(run: Path, tmp_path: Path, monkeypatch: py
     assert asked[1:] == [finished.images, finished.maps, tmp_path / "out/dense"]
     assert written == Written(
         name="dense",
-        remarks=(
+        notes=(
             f"without depth: {NAMES[0]}, {NAMES[1]}, {NAMES[2]} and 2 more",
             f"depth scaled as the whole model, for lack of points: {NAMES[7]}",
             "the fused cloud is empty",

@@ -34,7 +34,7 @@ from smust3r_colmap.execution.progress import (
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.report.summary import (
     EdgeSummary,
-    ImageRemark,
+    ImageNote,
     RefinementSummary,
     RunSummary,
 )
@@ -111,10 +111,10 @@ REFINED = RefinementSummary(
     weak=(),
     registered=(),
     principal_point="",
-    doubts=(),
+    warnings=(),
     steps=(),
 )
-WEAK = replace(GOOD, num_registered=4, unregistered=(ImageRemark(name="a.jpg", reason="too few matches"),))
+WEAK = replace(GOOD, num_registered=4, unregistered=(ImageNote(name="a.jpg", reason="too few matches"),))
 
 
 @pytest.mark.parametrize("quiet", [False, True])
@@ -488,17 +488,17 @@ def test_metric_needs_every_model() -> None:
     ("summary", "reason"),
     [
         (WEAK, "1 of 5 images got no pose"),
-        (replace(GOOD, rejected=(ImageRemark(name="x.jpg", reason="truncated"),)), "1 of 6 files could not be used"),
+        (replace(GOOD, rejected=(ImageNote(name="x.jpg", reason="truncated"),)), "1 of 6 files could not be used"),
         (
             replace(GOOD, models=(replace(GOOD.models[0], num_images=3), replace(GOOD.models[0], num_images=2))),
             "2 models that could not be connected; the largest has 3 of 5 images",
         ),
         (
-            replace(GOOD, segments=(replace(GOOD.segments[0], index=7, num_pieces=0, num_registered=0),)),
+            replace(GOOD, segments=(replace(GOOD.segments[0], index=7, num_submodels=0, num_registered=0),)),
             "nothing came out of segment 7",
         ),
         (
-            replace(GOOD, refinements=(replace(REFINED, doubts=("no adjustment stood: it diverged",)),)),
+            replace(GOOD, refinements=(replace(REFINED, warnings=("no adjustment stood: it diverged",)),)),
             "sparse/0: no adjustment stood: it diverged",
         ),
         (
@@ -516,8 +516,8 @@ def test_each_shortcoming_makes_the_result_weak(summary: RunSummary, reason: str
 
 
 def test_long_lists_are_cut_in_the_text_but_whole_in_the_json() -> None:
-    remarks = tuple(ImageRemark(name=f"{k}.jpg", reason="blurred") for k in range(8))
-    summary = replace(GOOD, num_images=13, unregistered=remarks)
+    notes = tuple(ImageNote(name=f"{k}.jpg", reason="blurred") for k in range(8))
+    summary = replace(GOOD, num_images=13, unregistered=notes)
 
     assert "4.jpg (blurred)" in summary.render_text()
     assert "5.jpg" not in summary.render_text()
@@ -656,13 +656,13 @@ def test_doctor_says_whether_must3r_has_its_weights(
     weights = tmp_path / "network.pth"
     weights.touch()
 
-    remarks = []
+    notes = []
     for named in ("", str(weights)):
         monkeypatch.setenv("SMUST3R_WEIGHTS", named)
         assert cli.main(["doctor", "--json"]) == 0
         (check,) = [one for one in json.loads(capsys.readouterr().out)["checks"] if one["kind"] == "backbone"]
         assert check["works"], check["advice"]
-        remarks.append(check["remarks"])
-    assert all(re.search("float32|bfloat16", one[0]) for one in remarks)
-    assert remarks[0][-1].startswith("no weights for --network-size 512")
-    assert remarks[1][-1] == f"weights: {weights}"
+        notes.append(check["notes"])
+    assert all(re.search("float32|bfloat16", one[0]) for one in notes)
+    assert notes[0][-1].startswith("no weights for --network-size 512")
+    assert notes[1][-1] == f"weights: {weights}"

@@ -161,10 +161,10 @@ def test_the_model_and_the_database_go_together(result: RunSummary) -> None:
 
 
 def test_everything_that_was_assumed_is_in_the_summary(result: RunSummary) -> None:
-    remarks = "\n".join(json.loads((result.output / "summary.json").read_text())["model_remarks"])
-    assert "8 images without a line of observations" in remarks
-    assert "rescaled from 518x392 to 320x240 px" in remarks
-    assert "8 cameras with one image each became one" in remarks
+    notes = "\n".join(json.loads((result.output / "summary.json").read_text())["model_notes"])
+    assert "8 images without a line of observations" in notes
+    assert "rescaled from 518x392 to 320x240 px" in notes
+    assert "8 cameras with one image each became one" in notes
 
 
 def test_the_files_are_those_of_a_reconstruction(result: RunSummary) -> None:

@@ -1,4 +1,4 @@
-"""Fusion on a world that is known: cameras round a painted unit sphere, cut into pieces."""
+"""Fusion on a world that is known: cameras round a painted unit sphere, cut into submodels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from helpers.sphere_world import (
     WINDOWS,
     MapsInMemory,
     World,
-    make_piece,
+    make_submodel,
     make_world,
     moved,
     paint,
@@ -30,22 +30,22 @@ from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
 from smust3r_colmap.geometry.sl4 import SL4
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.products import ImageCollection, SegmentPiece, SourceImage
+from smust3r_colmap.products import ImageCollection, SourceImage, Submodel
 from smust3r_colmap.stitching.camera_fusion import build_scene, centrality, fuse_cameras, fuse_intrinsics
-from smust3r_colmap.stitching.resection import PlacedPiece, place_piece
+from smust3r_colmap.stitching.resection import PlacedSubmodel, place_submodel
 
 # --------------------------------------------------------------------------- the world
 
 
 # ----------------------------------------------------------------------------- cameras
-def test_exact_pieces_give_back_the_exact_cameras() -> None:
+def test_exact_submodels_give_back_the_exact_cameras() -> None:
     world = make_world()
     cameras = world.cameras()
     assert cameras.images == tuple(range(NUM_IMAGES))
     np.testing.assert_allclose(invert_rigid(cameras.cam_from_world), world.world_from_cam, atol=1e-12)
-    assert cameras.num_pieces.tolist() == [1, 1, 1, 2, 2, 2, 2, 2, 2, 2, 1, 1, 1, 1]
+    assert cameras.num_submodels.tolist() == [1, 1, 1, 2, 2, 2, 2, 2, 2, 2, 1, 1, 1, 1]
     assert cameras.num_dropped.sum() == 0
-    alone = cameras.num_pieces == 1
+    alone = cameras.num_submodels == 1
     assert np.isnan(cameras.position_spread[alone]).all()
     assert np.isnan(cameras.rotation_spread_deg[alone]).all()
     assert cameras.position_spread[~alone].max() < 1e-12
@@ -55,7 +55,7 @@ def test_exact_pieces_give_back_the_exact_cameras() -> None:
     assert 0.2 * extent < cameras.scene_radius < 0.5 * extent
 
 
-def test_weights_fall_to_the_ends_of_a_piece() -> None:
+def test_weights_fall_to_the_ends_of_a_submodel() -> None:
     np.testing.assert_allclose(centrality(range(5)), [1 / 3, 2 / 3, 1, 2 / 3, 1 / 3])
     np.testing.assert_allclose(centrality(range(7, 11)), [0.5, 1, 1, 0.5])
     np.testing.assert_allclose(centrality([3]), [1])
@@ -68,7 +68,7 @@ def test_weights_fall_to_the_ends_of_each_run_but_not_at_a_few_missing_images() 
     np.testing.assert_allclose(centrality([0, 1, 8, 9]), [1, 1, 1, 1])
 
 
-def test_drift_is_blended_steadily_from_one_piece_to_the_next() -> None:
+def test_drift_is_blended_steadily_from_one_submodel_to_the_next() -> None:
     exact = make_world()
     cameras = shifted(exact, 1, (0.1, 0, 0)).cameras()
     part = invert_rigid(cameras.cam_from_world)[:, :, 3] - exact.world_from_cam[:, :, 3]
@@ -85,39 +85,41 @@ def test_spread_is_the_disagreement_in_parts_of_the_scene_and_degrees() -> None:
     assert np.nanmax(np.delete(cameras.position_spread, 4)) < 1e-9
 
 
-@pytest.mark.parametrize(("bad_piece", "image"), [(1, 4), (0, 5)])
+@pytest.mark.parametrize(("bad_submodel", "image"), [(1, 4), (0, 5)])
 @pytest.mark.parametrize(("shift", "turn_deg"), [((0.5, 0, 0), 0.0), ((0, 0, 0), 20.0), ((0.2, -0.1, 0.1), 5.0)])
-def test_one_bad_pose_is_dropped_where_the_other_piece_holds_the_image_more_central(
-    bad_piece: int, image: int, shift: tuple[float, ...], turn_deg: float
+def test_one_bad_pose_is_dropped_where_the_other_submodel_holds_the_image_more_central(
+    bad_submodel: int, image: int, shift: tuple[float, ...], turn_deg: float
 ) -> None:
     exact = make_world()
-    world = moved(exact, bad_piece, image, shift, turn_deg)
+    world = moved(exact, bad_submodel, image, shift, turn_deg)
     cameras = world.cameras()
     np.testing.assert_allclose(invert_rigid(cameras.cam_from_world), exact.world_from_cam, atol=1e-9)
     assert cameras.num_dropped.tolist() == [int(i == image) for i in range(NUM_IMAGES)]
-    assert cameras.best_piece[image] == 1 - bad_piece
+    assert cameras.best_submodel[image] == 1 - bad_submodel
 
 
-def test_two_of_three_pieces_outvote_the_most_central_one() -> None:
+def test_two_of_three_submodels_outvote_the_most_central_one() -> None:
     exact = make_world((range(0, 8), range(2, 10), range(4, 14), range(1, 5)))
     world = moved(exact, 1, 6, (0.5, 0, 0), 10)
-    assert centrality(range(8))[4] > centrality(range(8))[1], "the bad piece holds image 6 more central than the first"
+    assert centrality(range(8))[4] > centrality(range(8))[1], (
+        "the bad submodel holds image 6 more central than the first"
+    )
     cameras = world.cameras()
     np.testing.assert_allclose(invert_rigid(cameras.cam_from_world), exact.world_from_cam, atol=1e-9)
     assert cameras.num_dropped[6] == 1
-    assert cameras.best_piece[6] in (0, 2)
+    assert cameras.best_submodel[6] in (0, 2)
 
 
 def test_noise_is_averaged_down_but_not_out() -> None:
     exact = make_world((range(0, 14),) * 9)
     rng = np.random.default_rng(5)
-    pieces = []
-    for piece, world_from in zip(exact.pieces, exact.world_from_seg, strict=True):
+    submodels = []
+    for submodel, world_from in zip(exact.submodels, exact.world_from_seg, strict=True):
         noisy = exact.world_from_cam.copy()
         noisy[:, :, 3] += rng.normal(scale=0.01, size=(NUM_IMAGES, 3))
         noisy[:, :, :3] @= Rotation.from_rotvec(rng.normal(scale=0.01, size=(NUM_IMAGES, 3))).as_matrix()
-        pieces.append(replace(piece, seg_from_cam=world_from.inverse().move_cameras(noisy)))
-    fused = invert_rigid(replace(exact, pieces=pieces).cameras().cam_from_world)
+        submodels.append(replace(submodel, seg_from_cam=world_from.inverse().move_cameras(noisy)))
+    fused = invert_rigid(replace(exact, submodels=submodels).cameras().cam_from_world)
     rms = np.sqrt(np.mean((fused[:, :, 3] - exact.world_from_cam[:, :, 3]) ** 2))
     assert 0.01 / 9 < rms < 0.5 * 0.01  # the mean of nine has a third
     turn = Rotation.from_matrix(np.swapaxes(fused[:, :, :3], 1, 2) @ exact.world_from_cam[:, :, :3])
@@ -129,8 +131,8 @@ def test_rotations_stay_rotations_and_two_equal_votes_meet_half_way() -> None:
     turn = Rotation.from_euler("y", 40, degrees=True).as_matrix()
     poses = exact.world_from_cam.copy()
     poses[:, :, :3] @= turn
-    pieces = [exact.pieces[0], make_piece(1, range(14), exact.world_from_seg[1].inverse().move_cameras(poses))]
-    fused = invert_rigid(replace(exact, pieces=pieces).cameras().cam_from_world)
+    submodels = [exact.submodels[0], make_submodel(1, range(14), exact.world_from_seg[1].inverse().move_cameras(poses))]
+    fused = invert_rigid(replace(exact, submodels=submodels).cameras().cam_from_world)
     half = exact.world_from_cam[:, :, :3] @ Rotation.from_euler("y", 20, degrees=True).as_matrix()
     np.testing.assert_allclose(fused[:, :, :3], half, atol=1e-12)
 
@@ -138,24 +140,24 @@ def test_rotations_stay_rotations_and_two_equal_votes_meet_half_way() -> None:
 def test_three_opposite_votes_still_make_a_rotation() -> None:
     """Half turns about x, y and z: their mean is a reflection."""
     exact = make_world((range(0, 14),) * 3)
-    pieces = []
+    submodels = []
     for axis, world_from in enumerate(exact.world_from_seg):
         poses = exact.world_from_cam.copy()
         poses[:, :, :3] @= Rotation.from_rotvec(np.pi * np.eye(3)[axis]).as_matrix()
-        pieces.append(make_piece(axis, range(14), world_from.inverse().move_cameras(poses)))
-    rotations = replace(exact, pieces=pieces).cameras().cam_from_world[:, :, :3]
+        submodels.append(make_submodel(axis, range(14), world_from.inverse().move_cameras(poses)))
+    rotations = replace(exact, submodels=submodels).cameras().cam_from_world[:, :, :3]
     np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-12)
     np.testing.assert_allclose(rotations @ np.swapaxes(rotations, 1, 2), np.tile(np.eye(3), (14, 1, 1)), atol=1e-12)
 
 
-def test_pieces_that_disagree_everywhere_are_blended_and_the_spread_tells() -> None:
+def test_submodels_that_disagree_everywhere_are_blended_and_the_spread_tells() -> None:
     cameras = shifted(make_world(), 2, (0, 5, 0)).cameras()
     assert cameras.num_dropped.sum() == 0
     np.testing.assert_allclose(cameras.position_spread[7:10] * cameras.scene_radius, 5, rtol=1e-9)
 
 
-def test_fusing_needs_a_piece() -> None:
-    with pytest.raises(ValueError, match="no piece, needed at least one"):
+def test_fusing_needs_a_submodel() -> None:
+    with pytest.raises(ValueError, match="no submodel, needed at least one"):
         fuse_cameras([])
 
 
@@ -163,36 +165,36 @@ def test_fusing_needs_a_piece() -> None:
 LOOP = (0, 1, 2, 11, 12, 13)
 
 
-def test_loop_piece_has_no_say_where_a_window_placed_the_image() -> None:
+def test_loop_submodel_has_no_say_where_a_window_placed_the_image() -> None:
     without = make_world()
     world = shifted(make_world((*WINDOWS, LOOP)), 3, (0.1, 0, 0))
     cameras = fuse_cameras(world.placed(loops=[3]))
     np.testing.assert_array_equal(cameras.cam_from_world, without.cameras().cam_from_world)
-    np.testing.assert_array_equal(cameras.num_pieces, without.cameras().num_pieces)
-    np.testing.assert_array_equal(cameras.best_piece, without.cameras().best_piece)
+    np.testing.assert_array_equal(cameras.num_submodels, without.cameras().num_submodels)
+    np.testing.assert_array_equal(cameras.best_submodel, without.cameras().best_submodel)
     as_window = fuse_cameras(world.placed())
     assert np.abs(as_window.cam_from_world - cameras.cam_from_world).max() > 0.01
 
 
-def test_loop_piece_places_the_images_that_no_window_holds() -> None:
+def test_loop_submodel_places_the_images_that_no_window_holds() -> None:
     exact = make_world((range(1, 8), range(4, 13), LOOP))
     world = moved(exact, 2, 13, (0.1, 0, 0))
     cameras = fuse_cameras(world.placed(loops=[2]))
     assert cameras.images == tuple(range(14))
-    assert cameras.best_piece[[0, 13]].tolist() == [2, 2]
-    assert 2 not in cameras.best_piece[1:13]
-    assert cameras.num_pieces[[0, 1, 13]].tolist() == [1, 1, 1]
+    assert cameras.best_submodel[[0, 13]].tolist() == [2, 2]
+    assert 2 not in cameras.best_submodel[1:13]
+    assert cameras.num_submodels[[0, 1, 13]].tolist() == [1, 1, 1]
     wrong_by = invert_rigid(cameras.cam_from_world)[:, :, 3] - world.world_from_cam[:, :, 3]
     np.testing.assert_allclose(wrong_by[13], [0.1, 0, 0], atol=1e-12)
     np.testing.assert_allclose(wrong_by[:13], 0, atol=1e-12)
 
 
-def test_cloud_takes_pixels_of_a_loop_piece_only_for_its_own_images() -> None:
+def test_cloud_takes_pixels_of_a_loop_submodel_only_for_its_own_images() -> None:
     windows, loop = (range(1, 8), range(4, 13)), LOOP
     world = make_world((*windows, loop))
     placed = world.placed(loops=[2])
 
-    def num_pixels(world: World, placed: Sequence[PlacedPiece]) -> int:
+    def num_pixels(world: World, placed: Sequence[PlacedSubmodel]) -> int:
         cameras = fuse_cameras(placed)
         return fuse_points(placed, world.dense, cameras, max_points=20_000, min_confidence=2.0).num_pixels
 
@@ -201,10 +203,10 @@ def test_cloud_takes_pixels_of_a_loop_piece_only_for_its_own_images() -> None:
     assert num_pixels(world, placed) == num_pixels(alone, alone.placed()) + ends
 
 
-def test_loop_piece_votes_on_the_calibration_with_its_own_images_only() -> None:
+def test_loop_submodel_votes_on_the_calibration_with_its_own_images_only() -> None:
     world = make_world((range(1, 4), range(0, 14)))
-    pieces = [with_focal(p, f) for p, f in zip(world.pieces, (500.0, 600.0), strict=True)]
-    placed = replace(world, pieces=pieces).placed(loops=[1])
+    submodels = [with_focal(p, f) for p, f in zip(world.submodels, (500.0, 600.0), strict=True)]
+    placed = replace(world, submodels=submodels).placed(loops=[1])
     # Of camera 0 the window has all images, of camera 1 none.
     fused = fuse_intrinsics(placed, [0] * 4 + [1] * 10)
     # The loop has image 0 of camera 0: one vote against three.
@@ -223,8 +225,8 @@ def test_wider_groups_that_do_not_bend_give_the_same_scene(group: type[Transform
 
 
 @pytest.mark.parametrize("group", [Affine3, SL4])
-def test_bent_pieces_are_straightened_with_their_points(group: type[Affine3] | type[SL4]) -> None:
-    """A piece that was reconstructed warped, and the transform that takes the warp back."""
+def test_bent_submodels_are_straightened_with_their_points(group: type[Affine3] | type[SL4]) -> None:
+    """A submodel that was reconstructed warped, and the transform that takes the warp back."""
     world = make_world((range(0, 14),))
     tangent = 0.03 * np.random.default_rng(3).normal(size=group.DOF)
     warped_from_world = group.exp(tangent)
@@ -232,9 +234,9 @@ def test_bent_pieces_are_straightened_with_their_points(group: type[Affine3] | t
     for k, pointmap in enumerate(maps.pointmaps):
         maps.pointmaps[k] = warped_from_world.apply(pointmap.reshape(-1, 3)).reshape(pointmap.shape).astype(np.float32)
     bent_world = replace(world, world_from_seg=[warped_from_world.inverse()])
-    # The piece's own cameras are those that see the warped points best, as a backbone's would.
-    own = place_piece(world.pieces[0], make_world((range(0, 14),)).dense[0], warped_from_world)
-    bent_world.pieces[0] = replace(world.pieces[0], seg_from_cam=own.world_from_cam)
+    # The submodel's own cameras are those that see the warped points best, as a backbone's would.
+    own = place_submodel(world.submodels[0], make_world((range(0, 14),)).dense[0], warped_from_world)
+    bent_world.submodels[0] = replace(world.submodels[0], seg_from_cam=own.world_from_cam)
     cameras = bent_world.cameras()
     assert 0.1 < cameras.residual_px.max() < 30
     offsets = invert_rigid(cameras.cam_from_world)[:, :, 3] - world.world_from_cam[:, :, 3]
@@ -244,58 +246,58 @@ def test_bent_pieces_are_straightened_with_their_points(group: type[Affine3] | t
 
 
 # -------------------------------------------------------------------------- intrinsics
-def with_focal(piece: SegmentPiece, focal: float, **changes: object) -> SegmentPiece:
+def with_focal(submodel: Submodel, focal: float, **changes: object) -> Submodel:
     intrinsics = replace(CAMERA, params=(focal, 320, 240, -0.05), **changes)  # type: ignore[arg-type]
-    return replace(piece, intrinsics=(intrinsics,) * len(piece.images))
+    return replace(submodel, intrinsics=(intrinsics,) * len(submodel.images))
 
 
 def test_one_wild_focal_length_does_not_move_the_median() -> None:
     world = make_world()
-    pieces = [with_focal(p, f) for p, f in zip(world.pieces, (590.0, 610.0, 9000.0), strict=True)]
-    fused = fuse_intrinsics(replace(world, pieces=pieces).placed(), [0] * NUM_IMAGES)
+    submodels = [with_focal(p, f) for p, f in zip(world.submodels, (590.0, 610.0, 9000.0), strict=True)]
+    fused = fuse_intrinsics(replace(world, submodels=submodels).placed(), [0] * NUM_IMAGES)
     assert list(fused) == [0]
     assert fused[0].params == pytest.approx((610, 320, 240, -0.05), abs=0)
     assert (fused[0].model, fused[0].width, fused[0].height) == ("SIMPLE_RADIAL", 640, 480)
 
 
-def test_a_piece_votes_with_its_registered_images() -> None:
+def test_a_submodel_votes_with_its_registered_images() -> None:
     world = make_world((range(0, 3), range(1, 14), range(2, 4)))
-    pieces = [with_focal(p, f) for p, f in zip(world.pieces, (500.0, 600.0, 700.0), strict=True)]
-    assert fuse_intrinsics(replace(world, pieces=pieces).placed(), [0] * NUM_IMAGES)[0].params[0] == 600
+    submodels = [with_focal(p, f) for p, f in zip(world.submodels, (500.0, 600.0, 700.0), strict=True)]
+    assert fuse_intrinsics(replace(world, submodels=submodels).placed(), [0] * NUM_IMAGES)[0].params[0] == 600
 
 
 def test_cameras_are_fused_apart() -> None:
     world = make_world()
-    pieces = [with_focal(p, f) for p, f in zip(world.pieces, (500.0, 600.0, 700.0), strict=True)]
+    submodels = [with_focal(p, f) for p, f in zip(world.submodels, (500.0, 600.0, 700.0), strict=True)]
     camera_of_image = [2] * 3 + [7] * 7 + [4] * 4
-    fused = fuse_intrinsics(replace(world, pieces=pieces).placed(), camera_of_image)
-    # Camera 7 has images 3..9: in the first piece 4, in the second 7, in the third 3 times.
+    fused = fuse_intrinsics(replace(world, submodels=submodels).placed(), camera_of_image)
+    # Camera 7 has images 3..9: in the first submodel 4, in the second 7, in the third 3 times.
     assert {camera: intrinsics.params[0] for camera, intrinsics in fused.items()} == {2: 500, 4: 700, 7: 600}
 
 
 def test_the_model_of_most_images_is_taken() -> None:
     world = make_world()
-    pieces = list(world.pieces)
+    submodels = list(world.submodels)
     pinhole = Intrinsics(model="PINHOLE", width=640, height=480, params=(1, 1, 2, 2))
-    pieces[1] = replace(pieces[1], intrinsics=(pinhole,) * 7)
-    fused = fuse_intrinsics(replace(world, pieces=pieces).placed(), [0] * NUM_IMAGES)[0]
+    submodels[1] = replace(submodels[1], intrinsics=(pinhole,) * 7)
+    fused = fuse_intrinsics(replace(world, submodels=submodels).placed(), [0] * NUM_IMAGES)[0]
     assert (fused.model, fused.params) == (CAMERA.model, CAMERA.params)
 
 
-def test_a_focal_prior_holds_where_every_piece_had_it() -> None:
+def test_a_focal_prior_holds_where_every_submodel_had_it() -> None:
     world = make_world()
-    everywhere = [with_focal(piece, 600.0, has_prior_focal=True) for piece in world.pieces]
-    assert fuse_intrinsics(replace(world, pieces=everywhere).placed(), [0] * NUM_IMAGES)[0].has_prior_focal
-    mixed = replace(world, pieces=[*everywhere[:2], world.pieces[2]])
+    everywhere = [with_focal(submodel, 600.0, has_prior_focal=True) for submodel in world.submodels]
+    assert fuse_intrinsics(replace(world, submodels=everywhere).placed(), [0] * NUM_IMAGES)[0].has_prior_focal
+    mixed = replace(world, submodels=[*everywhere[:2], world.submodels[2]])
     assert not fuse_intrinsics(mixed.placed(), [0] * NUM_IMAGES)[0].has_prior_focal
 
 
 def test_one_camera_at_two_sizes_is_refused() -> None:
     world = make_world()
-    pieces = list(world.pieces)
-    pieces[1] = replace(pieces[1], intrinsics=(CAMERA.resized(320, 240),) * 7)
-    with pytest.raises(ValueError, match=r"camera 0: pieces hold it at sizes \[\(320, 240\), \(640, 480\)\]"):
-        fuse_intrinsics(replace(world, pieces=pieces).placed(), [0] * NUM_IMAGES)
+    submodels = list(world.submodels)
+    submodels[1] = replace(submodels[1], intrinsics=(CAMERA.resized(320, 240),) * 7)
+    with pytest.raises(ValueError, match=r"camera 0: submodels hold it at sizes \[\(320, 240\), \(640, 480\)\]"):
+        fuse_intrinsics(replace(world, submodels=submodels).placed(), [0] * NUM_IMAGES)
 
 
 # ------------------------------------------------------------------------------ points
@@ -345,19 +347,19 @@ def test_result_is_the_same_every_time() -> None:
     np.testing.assert_array_equal(first.cloud.normals, second.cloud.normals)
 
 
-def test_every_image_gives_its_pixels_once_from_the_piece_where_it_is_central() -> None:
+def test_every_image_gives_its_pixels_once_from_the_submodel_where_it_is_central() -> None:
     world = make_world()
     used = {0: range(0, 5), 1: range(5, 9), 2: range(9, 14)}
     expected = sum(
-        np.count_nonzero(world.dense[piece].confidences[world.pieces[piece].images.index(image)] >= 2)
-        for piece, images in used.items()
+        np.count_nonzero(world.dense[submodel].confidences[world.submodels[submodel].images.index(image)] >= 2)
+        for submodel, images in used.items()
         for image in images
     )
-    assert world.cameras().best_piece.tolist() == [p for p, images in used.items() for _ in images]
+    assert world.cameras().best_submodel.tolist() == [p for p, images in used.items() for _ in images]
     assert world.points().num_pixels == expected
 
 
-def test_cloud_moves_with_the_fused_cameras_not_with_the_pieces() -> None:
+def test_cloud_moves_with_the_fused_cameras_not_with_the_submodels() -> None:
     world = make_world()
     cameras = world.cameras()
     turn = Rotation.from_euler("xyz", [10, 20, 30], degrees=True).as_matrix()
@@ -380,7 +382,7 @@ def test_cloud_moves_with_the_fused_cameras_not_with_the_pieces() -> None:
 def test_pixels_of_a_wrong_pose_follow_the_pose_that_was_kept() -> None:
     """The map was made with the bad pose; carried by the kept one it lies right again."""
     exact = make_world()
-    world = moved(exact, 0, 1, (0.3, 0, 0))  # only the first piece holds image 1
+    world = moved(exact, 0, 1, (0.3, 0, 0))  # only the first submodel holds image 1
     pointmap = world.dense[0].pointmaps[1]
     world.dense[0].pointmaps[1] = pointmap + np.array([0.3, 0, 0], dtype=np.float32)
     cameras = replace(world.cameras(), cam_from_world=invert_rigid(exact.world_from_cam))
@@ -409,11 +411,11 @@ def test_pixels_below_the_confidence_are_left_out() -> None:
 def test_pixels_behind_the_camera_or_without_a_point_are_left_out() -> None:
     def spoil(world: World) -> None:
         k = 2
-        cam_from_seg = invert_rigid(world.pieces[0].seg_from_cam[k])
+        cam_from_seg = invert_rigid(world.submodels[0].seg_from_cam[k])
         points_cam = world.dense[0].pointmaps[k] @ cam_from_seg[:, :3].T + cam_from_seg[:, 3]
         points_cam[:, :30] *= -1
         points_cam[:, 30:] = np.nan
-        pose = world.pieces[0].seg_from_cam[k]
+        pose = world.submodels[0].seg_from_cam[k]
         world.dense[0].pointmaps[k] = (points_cam @ pose[:, :3].T + pose[:, 3]).astype(np.float32)
 
     spoiled = edited(spoil).points()
@@ -424,13 +426,13 @@ def test_pixels_behind_the_camera_or_without_a_point_are_left_out() -> None:
 
 def test_points_that_one_image_only_saw_are_dropped() -> None:
     def add_flying_pixels(world: World) -> None:
-        for piece, maps in enumerate(world.dense):
+        for submodel, maps in enumerate(world.dense):
             for k, confidence in enumerate(maps.confidences):
-                rng = np.random.default_rng([piece, k])
+                rng = np.random.default_rng([submodel, k])
                 confidence[0] = 5
                 # Each twice: two pixels of one image are one witness.
                 inside_world = np.repeat(rng.uniform(-0.5, 0.5, (maps.pointmaps[k].shape[1] // 2, 3)), 2, axis=0)
-                seg_from_world = world.world_from_seg[piece].inverse()
+                seg_from_world = world.world_from_seg[submodel].inverse()
                 maps.pointmaps[k][0] = seg_from_world.apply(inside_world).reshape(-1, 3)
 
     world = edited(add_flying_pixels)
@@ -458,8 +460,8 @@ def facing_cameras(pointmaps_world: Sequence[FloatArray]) -> World:
         [np.full(pointmap.shape[:2], 5, dtype=np.float32) for pointmap in pointmaps_world],
         [np.zeros(pointmap.shape, dtype=np.uint8) for pointmap in pointmaps_world],
     )
-    piece = make_piece(0, range(len(pointmaps_world)), world_from_cam)
-    return World(world_from_cam, [piece], [Sim3.identity()], [maps])
+    submodel = make_submodel(0, range(len(pointmaps_world)), world_from_cam)
+    return World(world_from_cam, [submodel], [Sim3.identity()], [maps])
 
 
 @pytest.mark.parametrize("max_points", [300, 700, 1000, 1500])
@@ -490,8 +492,8 @@ def test_maps_of_one_column_are_fused() -> None:
 
 def test_pixels_at_infinity_do_not_coarsen_the_cloud() -> None:
     def send_one_away(world: World) -> None:
-        for piece, maps in zip(world.pieces, world.dense, strict=True):
-            for centre, pointmap in zip(piece.seg_from_cam[:, :, 3], maps.pointmaps, strict=True):
+        for submodel, maps in zip(world.submodels, world.dense, strict=True):
+            for centre, pointmap in zip(submodel.seg_from_cam[:, :, 3], maps.pointmaps, strict=True):
                 pointmap[20, 25] += 1e9 * (pointmap[20, 25] - centre)
 
     fused = edited(send_one_away).points()
@@ -520,7 +522,7 @@ def test_points_need_sensible_arguments() -> None:
     world = make_world()
     with pytest.raises(ValueError, match=r"max_points is 0, needed at least 1"):
         world.points(max_points=0)
-    with pytest.raises(ValueError, match="3 pieces and 2 sets of maps"):
+    with pytest.raises(ValueError, match="3 submodels and 2 sets of maps"):
         fuse_points(world.placed(), world.dense[:2], world.cameras(), max_points=9, min_confidence=2.0)
 
 

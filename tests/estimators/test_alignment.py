@@ -1,4 +1,4 @@
-"""Sim(3) between pieces: the robust solver, and what finds its points."""
+"""Sim(3) between submodels: the robust solver, and what finds its points."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.alignment.from_pointmaps import align_pointmaps
 from smust3r_colmap.alignment.from_tracks import align_tracks, match_links, point_depths
-from smust3r_colmap.alignment.seen_points import PieceFit, align_seen_points
+from smust3r_colmap.alignment.seen_points import SubmodelFit, align_seen_points
 from smust3r_colmap.config import AlignmentConfig, RobustKernel, TransformGroup
 from smust3r_colmap.errors import DegenerateAlignmentError, ReconstructionError
 from smust3r_colmap.estimators.sim3 import consensus_sim3, estimate_sim3
@@ -24,7 +24,7 @@ from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.products import FeatureLinks, SegmentPiece, Tracks, TransformEstimate
+from smust3r_colmap.products import FeatureLinks, Submodel, Tracks, TransformEstimate
 
 KERNELS: tuple[RobustKernel, ...] = get_args(RobustKernel)
 REDESCENDING: tuple[RobustKernel, ...] = ("cauchy", "tukey")
@@ -381,10 +381,10 @@ class Maps:
 CAMERA = Intrinsics(model="SIMPLE_PINHOLE", width=64, height=48, params=(60.0, 32.0, 24.0))
 
 
-def piece_of(images: tuple[int, ...], *, segment: int = 0, tracks: Tracks | None = None) -> SegmentPiece:
-    return SegmentPiece(
+def submodel_of(images: tuple[int, ...], *, segment: int = 0, tracks: Tracks | None = None) -> Submodel:
+    return Submodel(
         segment=segment,
-        piece=0,
+        submodel=0,
         images=images,
         seg_from_cam=np.tile(np.eye(3, 4), (len(images), 1, 1)),
         intrinsics=(CAMERA,) * len(images),
@@ -421,7 +421,7 @@ def room_maps(*, noise: float, blobs: float, seed: int = 0) -> tuple[Maps, Maps]
     return sides[0], sides[1]
 
 
-TARGET, SOURCE = piece_of((0, 1, 2, 3, 4, 5)), piece_of((3, 4, 5, 6, 7, 8), segment=1)
+TARGET, SOURCE = submodel_of((0, 1, 2, 3, 4, 5)), submodel_of((3, 4, 5, 6, 7, 8), segment=1)
 TARGET_FROM_SOURCE = SOURCE_FROM_TARGET.inverse()
 
 
@@ -484,17 +484,19 @@ def test_pixels_without_confidence_or_geometry_take_no_part(spoil: str) -> None:
     assert fit.num_correspondences == pytest.approx(3 * 48 * 38, rel=0.02)
 
 
-def test_pieces_without_shared_images_are_refused() -> None:
+def test_submodels_without_shared_images_are_refused() -> None:
     maps, _ = room_maps(noise=0, blobs=0)
-    apart = piece_of((10, 11, 12, 13, 14, 15), segment=7)
-    with pytest.raises(DegenerateAlignmentError, match="pieces 0 and 7 share no image"):
+    apart = submodel_of((10, 11, 12, 13, 14, 15), segment=7)
+    with pytest.raises(DegenerateAlignmentError, match="submodels 0 and 7 share no image"):
         align_pointmaps(TARGET, apart, maps, maps, AlignmentConfig())
 
 
 def test_maps_without_confident_pixels_are_refused_by_name() -> None:
     target_maps, source_maps = room_maps(noise=0, blobs=0)
     target_maps.confidences[:] = 1.0
-    with pytest.raises(DegenerateAlignmentError, match="pieces 0 and 1, confident pixels of 3 images: 0 point pairs"):
+    with pytest.raises(
+        DegenerateAlignmentError, match="submodels 0 and 1, confident pixels of 3 images: 0 point pairs"
+    ):
         align_pointmaps(TARGET, SOURCE, target_maps, source_maps, AlignmentConfig())
 
 
@@ -505,19 +507,19 @@ def test_maps_of_two_sizes_are_refused() -> None:
         depths=source_maps.depths[:, ::2, ::2],
         confidences=source_maps.confidences[:, ::2, ::2],
     )
-    with pytest.raises(ReconstructionError, match=r"image 3: the maps are \(48, 64\) in piece 0 and \(24, 32\)"):
+    with pytest.raises(ReconstructionError, match=r"image 3: the maps are \(48, 64\) in submodel 0 and \(24, 32\)"):
         align_pointmaps(TARGET, SOURCE, target_maps, small, AlignmentConfig())
-    with pytest.raises(ValueError, match="piece 1: 2 images, 6 dense maps"):
-        align_pointmaps(TARGET, piece_of((3, 4), segment=1), target_maps, source_maps, AlignmentConfig())
+    with pytest.raises(ValueError, match="submodel 1: 2 images, 6 dense maps"):
+        align_pointmaps(TARGET, submodel_of((3, 4), segment=1), target_maps, source_maps, AlignmentConfig())
 
 
 # --------------------------------------------------------------------------------- tracks
 NUM_POINTS = 400
 
 
-def track_piece(
+def track_submodel(
     images: tuple[int, ...], gauge: Sim3, *, segment: int, noise: float = 0.0, feature_offset: int = 0
-) -> SegmentPiece:
+) -> Submodel:
     """Every image sees every point of one cloud; point p is feature (p * 7 + image) % P + offset."""
     rng = np.random.default_rng(segment)
     cloud = np.random.default_rng(99).uniform(-1, 1, (NUM_POINTS, 3)) * [3.0, 2.0, 1.5] + [0.0, 0.0, 5.0]
@@ -530,14 +532,14 @@ def track_piece(
         image_of_observation=image,
         feature_of_observation=(point * 7 + image) % NUM_POINTS + feature_offset,
     )
-    piece = piece_of(images, segment=segment, tracks=tracks)
+    submodel = submodel_of(images, segment=segment, tracks=tracks)
     at_origin = np.tile(np.eye(3, 4), (len(images), 1, 1))
-    return replace(piece, seg_from_cam=gauge.move_cameras(at_origin))
+    return replace(submodel, seg_from_cam=gauge.move_cameras(at_origin))
 
 
 def test_tracks_without_noise_give_the_transform_to_rounding() -> None:
-    target = track_piece((0, 1, 2), Sim3.identity(), segment=0)
-    source = track_piece((2, 3, 4), SOURCE_FROM_TARGET, segment=1)
+    target = track_submodel((0, 1, 2), Sim3.identity(), segment=0)
+    source = track_submodel((2, 3, 4), SOURCE_FROM_TARGET, segment=1)
     fit = align_tracks(target, source, AlignmentConfig())
     assert_close(fit.estimate.b_from_a, TARGET_FROM_SOURCE, 1e-9)
     assert fit.num_correspondences == fit.estimate.num_inliers == NUM_POINTS
@@ -546,8 +548,8 @@ def test_tracks_without_noise_give_the_transform_to_rounding() -> None:
 
 @pytest.mark.parametrize("group", ["affine3", "sl4"])
 def test_tracks_are_aligned_in_the_group_of_the_settings(group: TransformGroup) -> None:
-    target = track_piece((0, 1, 2), Sim3.identity(), segment=0, noise=0.002)
-    source = track_piece((2, 3, 4), SOURCE_FROM_TARGET, segment=1, noise=0.002)
+    target = track_submodel((0, 1, 2), Sim3.identity(), segment=0, noise=0.002)
+    source = track_submodel((2, 3, 4), SOURCE_FROM_TARGET, segment=1, noise=0.002)
     fit = align_tracks(target, source, AlignmentConfig(transform_group=group))
     assert type(fit.estimate.b_from_a) is GROUPS[group]
     assert fit.relative_residual < 0.004
@@ -555,8 +557,8 @@ def test_tracks_are_aligned_in_the_group_of_the_settings(group: TransformGroup) 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_noisy_tracks_report_their_relative_residual(kernel: RobustKernel) -> None:
-    target = track_piece((0, 1, 2), Sim3.identity(), segment=0, noise=0.01)
-    source = track_piece((1, 2, 3), SOURCE_FROM_TARGET, segment=1, noise=0.01)
+    target = track_submodel((0, 1, 2), Sim3.identity(), segment=0, noise=0.01)
+    source = track_submodel((1, 2, 3), SOURCE_FROM_TARGET, segment=1, noise=0.01)
     fit = align_tracks(target, source, AlignmentConfig(robust_kernel=kernel))
     assert float(sim3_of(fit.estimate).scale) == pytest.approx(1 / 1.7, rel=5e-3)
     # the median of |N(0, sqrt(2) %)|, over z-depths that are shorter than the rays
@@ -565,7 +567,7 @@ def test_noisy_tracks_report_their_relative_residual(kernel: RobustKernel) -> No
 
 def test_pair_of_points_counts_once_and_weighs_its_shared_observations() -> None:
     images = (0, 1, 2, 3, 4, 5, 6)
-    target, source = (track_piece(images, Sim3.identity(), segment=k) for k in (0, 1))
+    target, source = (track_submodel(images, Sim3.identity(), segment=k) for k in (0, 1))
     assert target.tracks is not None
     # Half of the points are seen together in one image only, and displaced.
     point_of_row = target.tracks.point_of_observation
@@ -587,10 +589,10 @@ def test_pair_of_points_counts_once_and_weighs_its_shared_observations() -> None
 
 
 def test_tracks_of_other_features_are_not_shared() -> None:
-    target = track_piece((0, 1, 2), Sim3.identity(), segment=0)
-    with pytest.raises(DegenerateAlignmentError, match="pieces 0 and 1, shared track points: 0 point pairs; 3"):
-        align_tracks(target, track_piece((3, 4), SOURCE_FROM_TARGET, segment=1), AlignmentConfig())
-    other = track_piece((0, 1, 2), SOURCE_FROM_TARGET, segment=1, feature_offset=NUM_POINTS + 7)
+    target = track_submodel((0, 1, 2), Sim3.identity(), segment=0)
+    with pytest.raises(DegenerateAlignmentError, match="submodels 0 and 1, shared track points: 0 point pairs; 3"):
+        align_tracks(target, track_submodel((3, 4), SOURCE_FROM_TARGET, segment=1), AlignmentConfig())
+    other = track_submodel((0, 1, 2), SOURCE_FROM_TARGET, segment=1, feature_offset=NUM_POINTS + 7)
     with pytest.raises(DegenerateAlignmentError, match="0 point pairs"):
         align_tracks(target, other, AlignmentConfig())
 
@@ -602,26 +604,26 @@ def test_depth_of_a_point_passes_over_cameras_that_it_is_behind() -> None:
         image_of_observation=np.array([5, 6, 5, 7]),
         feature_of_observation=np.array([0, 0, 1, 0]),
     )
-    piece = piece_of((5, 6, 7), tracks=tracks)
-    poses = piece.seg_from_cam.copy()
+    submodel = submodel_of((5, 6, 7), tracks=tracks)
+    poses = submodel.seg_from_cam.copy()
     poses[1, 2, 3] = 3.0  # at depth 1 from image 6
     poses[2, 2, 3] = 9.0  # behind image 7
-    depths = point_depths(replace(piece, seg_from_cam=poses))
+    depths = point_depths(replace(submodel, seg_from_cam=poses))
     np.testing.assert_allclose(depths, [2.0, np.nan, np.nan])  # sqrt(4 * 1)
 
 
-def test_pieces_without_usable_tracks_are_refused() -> None:
-    target = track_piece((0, 1), Sim3.identity(), segment=0)
-    with pytest.raises(ValueError, match="piece 3 has no tracks"):
-        align_tracks(target, piece_of((0, 1), segment=3), AlignmentConfig())
-    foreign = replace(track_piece((0, 9), Sim3.identity(), segment=4), images=(0, 1))
-    with pytest.raises(ValueError, match=r"piece 4: tracks name images \[9\]"):
-        align_tracks(target, foreign, AlignmentConfig())
+def test_submodels_without_usable_tracks_are_refused() -> None:
+    target = track_submodel((0, 1), Sim3.identity(), segment=0)
+    with pytest.raises(ValueError, match="submodel 3 has no tracks"):
+        align_tracks(target, submodel_of((0, 1), segment=3), AlignmentConfig())
+    external = replace(track_submodel((0, 9), Sim3.identity(), segment=4), images=(0, 1))
+    with pytest.raises(ValueError, match=r"submodel 4: tracks name images \[9\]"):
+        align_tracks(target, external, AlignmentConfig())
 
 
 # ---------------------------------------------------------------------------------- links
 def links_between(wrong: float, *, seed: int = 0) -> FeatureLinks:
-    """Matches of image 1 of one piece with image 5 of the other; the wrong ones name any feature."""
+    """Matches of image 1 of one submodel with image 5 of the other; the wrong ones name any feature."""
     rng = np.random.default_rng(seed)
     point = np.arange(NUM_POINTS)
     other = np.where(rng.random(NUM_POINTS) < wrong, rng.integers(0, NUM_POINTS, NUM_POINTS), point)
@@ -633,9 +635,7 @@ def links_between(wrong: float, *, seed: int = 0) -> FeatureLinks:
     )
 
 
-def fit_to_links(
-    target: SegmentPiece, source: SegmentPiece, links: FeatureLinks, settings: AlignmentConfig
-) -> PieceFit:
+def fit_to_links(target: Submodel, source: Submodel, links: FeatureLinks, settings: AlignmentConfig) -> SubmodelFit:
     return match_links(
         target,
         source,
@@ -650,8 +650,8 @@ def fit_to_links(
 @pytest.mark.parametrize("kernel", REDESCENDING)
 @pytest.mark.parametrize("wrong", [0.4, 0.7])
 def test_match_links_survive_wrong_links(kernel: RobustKernel, wrong: float) -> None:
-    target = track_piece((0, 1, 2), Sim3.identity(), segment=0, noise=0.005)
-    source = track_piece((4, 5, 6), SOURCE_FROM_TARGET, segment=1, noise=0.005)
+    target = track_submodel((0, 1, 2), Sim3.identity(), segment=0, noise=0.005)
+    source = track_submodel((4, 5, 6), SOURCE_FROM_TARGET, segment=1, noise=0.005)
     settings = AlignmentConfig(robust_kernel=kernel)
     fit = fit_to_links(target, source, links_between(wrong), settings)
     assert float(sim3_of(fit.estimate).scale) == pytest.approx(1 / 1.7, rel=4e-3)
@@ -662,26 +662,26 @@ def test_match_links_survive_wrong_links(kernel: RobustKernel, wrong: float) -> 
 
 
 def test_match_links_without_noise_or_wrong_links_are_exact() -> None:
-    target = track_piece((0, 1, 2), Sim3.identity(), segment=0)
-    source = track_piece((4, 5, 6), SOURCE_FROM_TARGET, segment=1)
+    target = track_submodel((0, 1, 2), Sim3.identity(), segment=0)
+    source = track_submodel((4, 5, 6), SOURCE_FROM_TARGET, segment=1)
     fit = fit_to_links(target, source, links_between(0.0), AlignmentConfig())
     assert_close(fit.estimate.b_from_a, TARGET_FROM_SOURCE, 1e-9)
 
 
 def test_links_to_no_point_are_passed_over() -> None:
-    target = track_piece((0, 1, 2), Sim3.identity(), segment=0)
-    source = track_piece((4, 5, 6), SOURCE_FROM_TARGET, segment=1)
+    target = track_submodel((0, 1, 2), Sim3.identity(), segment=0)
+    source = track_submodel((4, 5, 6), SOURCE_FROM_TARGET, segment=1)
     links = links_between(0.0)
     links.feature_a[:50] += 10_000
     links.image_b[50:70] = 77
     assert fit_to_links(target, source, links, AlignmentConfig()).num_correspondences == NUM_POINTS - 70
     links.image_b[:] = 77
-    with pytest.raises(DegenerateAlignmentError, match="pieces 0 and 1, points linked by matches: 0 point pairs"):
+    with pytest.raises(DegenerateAlignmentError, match="submodels 0 and 1, points linked by matches: 0 point pairs"):
         fit_to_links(target, source, links, AlignmentConfig())
 
 
 def test_links_of_different_length_are_refused() -> None:
-    target = track_piece((0, 1), Sim3.identity(), segment=0)
+    target = track_submodel((0, 1), Sim3.identity(), segment=0)
     row = np.zeros(5, dtype=np.int64)
     with pytest.raises(ValueError, match=r"needed \(M,\) each"):
         match_links(target, target, AlignmentConfig(), image_a=row, feature_a=row, image_b=row[:-1], feature_b=row)

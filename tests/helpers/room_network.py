@@ -131,16 +131,16 @@ class RoomPredictor:
 
     Args:
         collection: the photographs of ``write_demo``, all of them.
-        doubts: of every segment, or empty.
+        warnings: of every segment, or empty.
     """
 
     name = "room"
     metric = True
 
-    def __init__(self, collection: ImageCollection, *, doubts: str) -> None:
+    def __init__(self, collection: ImageCollection, *, warnings: str) -> None:
         self.collection = collection
-        self.doubts = doubts
-        self.key = doubts
+        self.warnings = warnings
+        self.key = warnings
         self.network = RoomNetwork(len(collection), unit_m=1)
 
     def describe(self) -> Float32Array:
@@ -158,4 +158,4 @@ class RoomPredictor:
             intrinsics = pinhole(image.width, image.height, answer.focal_px)
             images.append(PredictedImage(image=k, seg_from_cam=answer.world_from_cam, intrinsics=intrinsics, maps=maps))
             stage.advance()
-        return SegmentPrediction(images=images, method="truth", doubts=(self.doubts,) if self.doubts else ())
+        return SegmentPrediction(images=images, method="truth", warnings=(self.warnings,) if self.warnings else ())

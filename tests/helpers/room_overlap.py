@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from smust3r_colmap.alignment.seen_points import PieceFit, align_seen_points
+from smust3r_colmap.alignment.seen_points import SubmodelFit, align_seen_points
 from smust3r_colmap.config import RobustKernel, TransformGroup
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import Sim3
@@ -39,7 +39,7 @@ class Overlap:
         apart = target_from_source.apply(self.exact_source) - self.exact_target
         return 100 * float(np.linalg.norm(apart, axis=1).mean())
 
-    def aligned(self, group: TransformGroup, kernel: RobustKernel = "cauchy", **changes: Any) -> PieceFit:
+    def aligned(self, group: TransformGroup, kernel: RobustKernel = "cauchy", **changes: Any) -> SubmodelFit:
         arguments = {
             "points_source": self.points_source,
             "points_target": self.points_target,

@@ -1,4 +1,4 @@
-"""Small synthetic pieces and models that several test modules use."""
+"""Small synthetic submodels and models that several test modules use."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import Sim3
-from smust3r_colmap.products import SegmentPiece, Tracks
+from smust3r_colmap.products import Submodel, Tracks
 
 CAMERA = Intrinsics(model="PINHOLE", width=640, height=480, params=(500.0, 500.0, 320.0, 240.0))
 
@@ -31,17 +31,17 @@ def points_ahead(num_points: int, rng: np.random.Generator) -> FloatArray:
     return rng.uniform([-4.0, -2.0, 4.0], [10.0, 2.0, 12.0], size=(num_points, 3))
 
 
-def make_piece(
+def make_submodel(
     world_from_cam: FloatArray,
     images: tuple[int, ...],
     points_world: FloatArray,
     seg_from_world: Sim3,
     *,
     segment: int = 0,
-    piece: int = 0,
+    submodel: int = 0,
     with_tracks: bool = True,
-) -> SegmentPiece:
-    """A piece that sees every point in every image; point p is feature p of each image."""
+) -> Submodel:
+    """A submodel that sees every point in every image; point p is feature p of each image."""
     p = len(points_world)
     tracks = Tracks(
         points_seg=seg_from_world.apply(points_world),
@@ -49,9 +49,9 @@ def make_piece(
         image_of_observation=np.repeat(np.array(images, dtype=np.int64), p),
         feature_of_observation=np.tile(np.arange(p), len(images)),
     )
-    return SegmentPiece(
+    return Submodel(
         segment=segment,
-        piece=piece,
+        submodel=submodel,
         images=images,
         seg_from_cam=seg_from_world.move_cameras(world_from_cam[list(images)]),
         intrinsics=(CAMERA,) * len(images),

@@ -14,9 +14,9 @@ from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres, pointmap_from_depth
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.products import DenseMaps, SegmentPiece
+from smust3r_colmap.products import DenseMaps, Submodel
 from smust3r_colmap.stitching.camera_fusion import FusedCameras, fuse_cameras
-from smust3r_colmap.stitching.resection import PlacedPiece, place_piece
+from smust3r_colmap.stitching.resection import PlacedSubmodel, place_submodel
 
 CAMERA = Intrinsics(model="SIMPLE_RADIAL", width=640, height=480, params=(600, 320, 240, -0.05))
 NUM_IMAGES = 14
@@ -75,14 +75,14 @@ class MapsInMemory:
 @dataclass
 class World:
     world_from_cam: FloatArray
-    pieces: list[SegmentPiece]
+    submodels: list[Submodel]
     world_from_seg: Sequence[Transform]
     dense: list[MapsInMemory]
 
-    def placed(self, loops: Collection[int] = ()) -> list[PlacedPiece]:
-        """The pieces in the world; those at the positions ``loops`` are of loop segments."""
-        parts = zip(self.pieces, self.dense, self.world_from_seg, strict=True)
-        return [place_piece(*part, is_loop=position in loops) for position, part in enumerate(parts)]
+    def placed(self, loops: Collection[int] = ()) -> list[PlacedSubmodel]:
+        """The submodels in the world; those at the positions ``loops`` are of loop segments."""
+        parts = zip(self.submodels, self.dense, self.world_from_seg, strict=True)
+        return [place_submodel(*part, is_loop=position in loops) for position, part in enumerate(parts)]
 
     def cameras(self) -> FusedCameras:
         return fuse_cameras(self.placed())
@@ -112,10 +112,10 @@ def gauges(count: int) -> list[Sim3]:
     return [Sim3.identity(), *others]
 
 
-def make_piece(segment: int, images: Sequence[int], seg_from_cam: FloatArray) -> SegmentPiece:
-    return SegmentPiece(
+def make_submodel(segment: int, images: Sequence[int], seg_from_cam: FloatArray) -> Submodel:
+    return Submodel(
         segment=segment,
-        piece=0,
+        submodel=0,
         images=tuple(images),
         seg_from_cam=seg_from_cam,
         intrinsics=(CAMERA,) * len(images),
@@ -128,10 +128,10 @@ def make_piece(segment: int, images: Sequence[int], seg_from_cam: FloatArray) ->
 def make_world(windows: Sequence[Sequence[int]] = WINDOWS) -> World:
     world_from_cam = sphere_cameras()
     world_from_seg = gauges(len(windows))
-    pieces, dense = [], []
+    submodels, dense = [], []
     for segment, (images, world_from) in enumerate(zip(windows, world_from_seg, strict=True)):
         seg_from_cam = world_from.inverse().move_cameras(world_from_cam[list(images)])
-        pieces.append(make_piece(segment, images, seg_from_cam))
+        submodels.append(make_submodel(segment, images, seg_from_cam))
         maps = MapsInMemory([], [], [])
         for image, pose in zip(images, seg_from_cam, strict=True):
             camera = CAMERA.resized(*MAP_SIZES[image % 2])
@@ -140,19 +140,19 @@ def make_world(windows: Sequence[Sequence[int]] = WINDOWS) -> World:
             maps.confidences.append(np.where(depth > 0, 5, 1).astype(np.float32))
             maps.colours.append(paint(pointmap_from_depth(depth, camera, world_from_cam[image]).astype(np.float64)))
         dense.append(maps)
-    return World(world_from_cam, pieces, world_from_seg, dense)
+    return World(world_from_cam, submodels, world_from_seg, dense)
 
 
-def moved(world: World, piece: int, image: int, shift: Sequence[float], turn_deg: float = 0.0) -> World:
-    """The same world, where one piece has one camera wrong by a shift and a turn in world units."""
-    k = world.pieces[piece].images.index(image)
-    world_from_cam = world.world_from_seg[piece].move_cameras(world.pieces[piece].seg_from_cam)
+def moved(world: World, submodel: int, image: int, shift: Sequence[float], turn_deg: float = 0.0) -> World:
+    """The same world, where one submodel has one camera wrong by a shift and a turn in world units."""
+    k = world.submodels[submodel].images.index(image)
+    world_from_cam = world.world_from_seg[submodel].move_cameras(world.submodels[submodel].seg_from_cam)
     world_from_cam[k, :, 3] += shift
     world_from_cam[k, :, :3] @= Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
-    seg_from_cam = world.world_from_seg[piece].inverse().move_cameras(world_from_cam)
-    pieces = list(world.pieces)
-    pieces[piece] = replace(pieces[piece], seg_from_cam=seg_from_cam)
-    return replace(world, pieces=pieces)
+    seg_from_cam = world.world_from_seg[submodel].inverse().move_cameras(world_from_cam)
+    submodels = list(world.submodels)
+    submodels[submodel] = replace(submodels[submodel], seg_from_cam=seg_from_cam)
+    return replace(world, submodels=submodels)
 
 
 def shifted_by(world_from_seg: Transform, shift: FloatArray) -> Sim3:
@@ -161,8 +161,8 @@ def shifted_by(world_from_seg: Transform, shift: FloatArray) -> Sim3:
     return Sim3.from_matrix(matrix)
 
 
-def shifted(world: World, piece: int, shift: Sequence[float]) -> World:
-    """The same world, where the whole of one piece is off by a shift in world units."""
+def shifted(world: World, submodel: int, shift: Sequence[float]) -> World:
+    """The same world, where the whole of one submodel is off by a shift in world units."""
     world_from_seg = list(world.world_from_seg)
-    world_from_seg[piece] = shifted_by(world_from_seg[piece], np.asarray(shift))
+    world_from_seg[submodel] = shifted_by(world_from_seg[submodel], np.asarray(shift))
     return replace(world, world_from_seg=world_from_seg)

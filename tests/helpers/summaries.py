@@ -18,7 +18,9 @@ GOOD = RunSummary(
         StageSummary(name="features", wall_s=1.0, cpu_s=1.5, reused=False),
         StageSummary(name="alignment", wall_s=0.2, cpu_s=0.1, reused=True),
     ),
-    segments=(SegmentSummary(index=0, kind="window", num_images=4, num_pieces=1, num_registered=4, method="mapping"),),
+    segments=(
+        SegmentSummary(index=0, kind="window", num_images=4, num_submodels=1, num_registered=4, method="mapping"),
+    ),
     edges=(EdgeSummary(target="0", source="1", evidence="tracks", relative_residual=0.01, accepted=True),),
     loops=(),
     loops_note="",

@@ -14,7 +14,7 @@ import pytest
 from smust3r_colmap.errors import ConfigError, InputError
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.camera_prior import CameraTags
-from smust3r_colmap.importers.colmap_model import ForeignModel, SurfacePoints, read_colmap_model
+from smust3r_colmap.importers.colmap_model import ExternalModel, SurfacePoints, read_colmap_model
 from smust3r_colmap.importers.fitted_model import FittedModel, fit_to_images
 from smust3r_colmap.importers.image_folder import FolderScan, ImportRecord
 from smust3r_colmap.importers.images import Photo
@@ -51,7 +51,7 @@ class Text:
         return folder
 
 
-def read(text: Text, tmp_path: Path) -> ForeignModel:
+def read(text: Text, tmp_path: Path) -> ExternalModel:
     return read_colmap_model(text.write(tmp_path / "model"))
 
 
@@ -312,14 +312,14 @@ def intrinsics(width: int = 200, height: int = 100, focal: float = 150.0, model:
     return Intrinsics(model=model, width=width, height=height, params=params[model])
 
 
-def foreign(
+def external(
     names: Sequence[str], cameras: Sequence[Intrinsics], camera_ids: Sequence[int] | None = None
-) -> ForeignModel:
+) -> ExternalModel:
     """A model of images that stand in a row; without ids each has the camera of its position."""
     n = len(names)
     poses = np.tile(np.eye(3, 4), (n, 1, 1))
     poses[:, 0, 3] = np.arange(n)
-    return ForeignModel(
+    return ExternalModel(
         folder=Path("export"),
         names=tuple(names),
         camera_ids=tuple(range(n) if camera_ids is None else camera_ids),
@@ -357,7 +357,7 @@ def names_of(fitted: FittedModel) -> list[str]:
 
 
 def test_images_come_in_natural_order_with_their_own_poses() -> None:
-    fitted = fit_to_images(foreign(["i10.jpg", "i9.jpg"], [intrinsics()], [0, 0]), scanned("i9.jpg", "i10.jpg"))
+    fitted = fit_to_images(external(["i10.jpg", "i9.jpg"], [intrinsics()], [0, 0]), scanned("i9.jpg", "i10.jpg"))
     assert names_of(fitted) == ["i9.jpg", "i10.jpg"]
     assert fitted.cam_from_world[:, 0, 3].tolist() == [1, 0]
     assert not fitted.collection.calibrated
@@ -373,31 +373,31 @@ def test_images_come_in_natural_order_with_their_own_poses() -> None:
     ],
 )
 def test_files_are_found_by_what_is_unique_and_it_is_said(in_model: list[str], in_folder: list[str], how: str) -> None:
-    fitted = fit_to_images(foreign(in_model, [intrinsics()], [0, 0]), scanned(*in_folder))
+    fitted = fit_to_images(external(in_model, [intrinsics()], [0, 0]), scanned(*in_folder))
     assert sorted(names_of(fitted)) == sorted(in_folder)
-    assert any(f"2 images found by their {how}" in remark for remark in fitted.remarks)
+    assert any(f"2 images found by their {how}" in note for note in fitted.notes)
 
 
 def test_an_exact_name_wins_over_others_of_the_same_base_name() -> None:
-    fitted = fit_to_images(foreign(["l/a.jpg", "r/a.jpg"], [intrinsics()], [0, 0]), scanned("l/a.jpg", "r/a.jpg"))
+    fitted = fit_to_images(external(["l/a.jpg", "r/a.jpg"], [intrinsics()], [0, 0]), scanned("l/a.jpg", "r/a.jpg"))
     assert names_of(fitted) == ["l/a.jpg", "r/a.jpg"]
-    assert not any("found by" in remark for remark in fitted.remarks)
+    assert not any("found by" in note for note in fitted.notes)
 
 
 def test_a_name_that_fits_two_files_is_refused_with_both() -> None:
-    model = foreign(["a.jpg", "b.jpg"], [intrinsics()], [0, 0])
+    model = external(["a.jpg", "b.jpg"], [intrinsics()], [0, 0])
     with pytest.raises(InputError, match=r"image 'a.jpg' could be 'l/a.jpg', 'r/a.jpg' of photos, .* base name"):
         fit_to_images(model, scanned("l/a.jpg", "r/a.jpg", "b.jpg"))
 
 
 def test_two_images_that_fit_one_file_are_refused_with_both() -> None:
-    model = foreign(["l/a.jpg", "r/a.jpg"], [intrinsics()], [0, 0])
+    model = external(["l/a.jpg", "r/a.jpg"], [intrinsics()], [0, 0])
     with pytest.raises(InputError, match=r"images 'l/a.jpg' and 'r/a.jpg' both fit the file 'a.jpg'"):
         fit_to_images(model, scanned("a.jpg", "b.jpg"))
 
 
 def test_images_without_a_usable_file_are_left_out_by_name() -> None:
-    model = foreign(["a.jpg", "b.jpg", "c.jpg", "d.jpg"], [intrinsics()], [0] * 4)
+    model = external(["a.jpg", "b.jpg", "c.jpg", "d.jpg"], [intrinsics()], [0] * 4)
     fitted = fit_to_images(model, scanned("a.jpg", "b.jpg", "c.jpg", damaged=["c.jpg"]))
     reasons = {one.name: one.reason for one in fitted.collection.rejected}
     assert reasons == {"c.jpg": "cut off", "d.jpg": "has a pose, but no file of that name is in photos"}
@@ -405,21 +405,19 @@ def test_images_without_a_usable_file_are_left_out_by_name() -> None:
 
 def test_images_without_a_pose_are_among_the_rejected() -> None:
     model = replace(
-        foreign(["a.jpg", "b.jpg"], [intrinsics()], [0, 0]), unposed=(RejectedImage(name="n.jpg", reason="nan"),)
+        external(["a.jpg", "b.jpg"], [intrinsics()], [0, 0]), unposed=(RejectedImage(name="n.jpg", reason="nan"),)
     )
     fitted = fit_to_images(model, scanned("a.jpg", "b.jpg", "n.jpg"))
     assert [one.name for one in fitted.collection.rejected] == ["n.jpg"]
 
 
 def test_files_that_the_model_lacks_are_told() -> None:
-    fitted = fit_to_images(foreign(["a.jpg", "b.jpg"], [intrinsics()], [0, 0]), scanned("a.jpg", "b.jpg", "z.jpg"))
-    assert any(
-        "1 files of the folder are not in the model" in remark and "'z.jpg'" in remark for remark in fitted.remarks
-    )
+    fitted = fit_to_images(external(["a.jpg", "b.jpg"], [intrinsics()], [0, 0]), scanned("a.jpg", "b.jpg", "z.jpg"))
+    assert any("1 files of the folder are not in the model" in note and "'z.jpg'" in note for note in fitted.notes)
 
 
 def test_files_that_the_model_lacks_come_behind_its_images_with_the_camera_of_their_like() -> None:
-    model = foreign(["b.jpg", "c.jpg"], [intrinsics()], [0, 0])
+    model = external(["b.jpg", "c.jpg"], [intrinsics()], [0, 0])
     small = scanned("tele.jpg", size=(100, 80)).records
     scan = scanned("a.jpg", "b.jpg", "c.jpg")
     fitted = fit_to_images(model, replace(scan, records=(*scan.records, *small)), complete=True, camera_model="RADIAL")
@@ -428,7 +426,7 @@ def test_files_that_the_model_lacks_come_behind_its_images_with_the_camera_of_th
     guess = fitted.collection.cameras[1]
     assert (guess.model, guess.width, guess.height, guess.focal_px) == ("RADIAL", 100, 80, 120)
     assert fitted.num_posed == len(fitted.scene("given")) == 2
-    assert not any("stay out" in remark for remark in fitted.remarks)
+    assert not any("stay out" in note for note in fitted.notes)
 
 
 def test_a_guessed_camera_is_that_of_a_run_and_not_the_fisheye_of_the_model() -> None:
@@ -438,19 +436,19 @@ def test_a_guessed_camera_is_that_of_a_run_and_not_the_fisheye_of_the_model() ->
         for names, size in ((("a.jpg", "b.jpg"), (200, 100)), (("x.jpg", "y.jpg"), (160, 120)))
     ]
     scan = replace(scanned("a.jpg"), records=(*records[0], *records[1]))
-    fitted = fit_to_images(foreign(["a.jpg", "b.jpg"], [fisheye], [0, 0]), scan, complete=True)
+    fitted = fit_to_images(external(["a.jpg", "b.jpg"], [fisheye], [0, 0]), scan, complete=True)
     assert [camera.model for camera in fitted.collection.cameras] == ["OPENCV_FISHEYE", "SIMPLE_RADIAL"]
-    assert any("1 cameras were guessed as SIMPLE_RADIAL, " in one and "for 2 images" in one for one in fitted.remarks)
+    assert any("1 cameras were guessed as SIMPLE_RADIAL, " in one and "for 2 images" in one for one in fitted.notes)
     plain = fit_to_images(
-        foreign(["a.jpg", "b.jpg"], [fisheye], [0, 0]), scanned("a.jpg", "b.jpg", "c.jpg"), complete=True
+        external(["a.jpg", "b.jpg"], [fisheye], [0, 0]), scanned("a.jpg", "b.jpg", "c.jpg"), complete=True
     )
-    assert not any("guessed" in remark for remark in plain.remarks)
+    assert not any("guessed" in note for note in plain.notes)
 
 
 def test_no_camera_is_guessed_where_all_are_known() -> None:
     small = scanned("tele.jpg", size=(100, 80)).records
     scan = replace(scanned("a.jpg", "b.jpg", "c.jpg"), records=(*scanned("a.jpg", "b.jpg", "c.jpg").records, *small))
-    fitted = fit_to_images(foreign(["b.jpg", "c.jpg"], [intrinsics()], [0, 0]), scan, complete=True, calibrated=True)
+    fitted = fit_to_images(external(["b.jpg", "c.jpg"], [intrinsics()], [0, 0]), scan, complete=True, calibrated=True)
     assert names_of(fitted) == ["b.jpg", "c.jpg", "a.jpg"]
     (left_out,) = fitted.collection.rejected
     assert (left_out.name, left_out.reason) == ("tele.jpg", "no image of the model is of its size and camera")
@@ -458,7 +456,7 @@ def test_no_camera_is_guessed_where_all_are_known() -> None:
 
 def test_an_image_without_a_pose_in_the_model_is_placed_like_one_that_it_lacks() -> None:
     nameless = RejectedImage(name="a.jpg", reason="its pose in the model is not finite")
-    model = replace(foreign(["b.jpg", "c.jpg"], [intrinsics()], [0, 0]), unposed=(nameless,))
+    model = replace(external(["b.jpg", "c.jpg"], [intrinsics()], [0, 0]), unposed=(nameless,))
     fitted = fit_to_images(model, scanned("a.jpg", "b.jpg", "c.jpg"), complete=True)
     assert names_of(fitted) == ["b.jpg", "c.jpg", "a.jpg"]
     assert fitted.collection.rejected == ()
@@ -467,7 +465,7 @@ def test_an_image_without_a_pose_in_the_model_is_placed_like_one_that_it_lacks()
 @pytest.mark.parametrize("name", ["images/a.jpg", "a.png"])
 def test_an_image_without_a_pose_that_is_placed_under_another_spelling_is_not_left_out_too(name: str) -> None:
     unposed = tuple(RejectedImage(name=one, reason="its pose is not finite") for one in (name, "gone.jpg"))
-    model = replace(foreign(["b.jpg", "c.jpg"], [intrinsics()], [0, 0]), unposed=unposed)
+    model = replace(external(["b.jpg", "c.jpg"], [intrinsics()], [0, 0]), unposed=unposed)
     fitted = fit_to_images(model, scanned("a.jpg", "b.jpg", "c.jpg"), complete=True)
     assert names_of(fitted) == ["b.jpg", "c.jpg", "a.jpg"]
     assert [one.name for one in fitted.collection.rejected] == ["gone.jpg"]
@@ -475,7 +473,7 @@ def test_an_image_without_a_pose_that_is_placed_under_another_spelling_is_not_le
 
 def test_each_file_is_that_of_one_image_without_a_pose() -> None:
     unposed = tuple(RejectedImage(name=one, reason="its pose is not finite") for one in ("l/a.jpg", "r/a.jpg"))
-    model = replace(foreign(["b.jpg", "c.jpg"], [intrinsics()], [0, 0]), unposed=unposed)
+    model = replace(external(["b.jpg", "c.jpg"], [intrinsics()], [0, 0]), unposed=unposed)
     fitted = fit_to_images(model, scanned("r/a.jpg", "b.jpg", "c.jpg"), complete=True)
     assert [one.name for one in fitted.collection.rejected] == ["l/a.jpg"]
 
@@ -488,26 +486,26 @@ def test_points_without_tracks_are_told_from_the_others(tmp_path: Path) -> None:
 
 def test_a_folder_of_other_images_is_refused_with_examples_of_both() -> None:
     with pytest.raises(InputError, match=r"files for 1 of 2 images of export, needed are 2; .*'b.jpg'.*'x.jpg'"):
-        fit_to_images(foreign(["a.jpg", "b.jpg"], [intrinsics()], [0, 0]), scanned("a.jpg", "x.jpg"))
+        fit_to_images(external(["a.jpg", "b.jpg"], [intrinsics()], [0, 0]), scanned("a.jpg", "x.jpg"))
 
 
 def test_intrinsics_of_the_network_are_brought_to_the_file_axis_by_axis() -> None:
     """518x294 for 16:9 rounds the height from 291.4: focal lengths differ by 0.9 % and are equal again after."""
     network = Intrinsics(model="PINHOLE", width=518, height=294, params=(400, 400 * 294 / 291.375, 259, 147))
     fitted = fit_to_images(
-        foreign(["a.jpg", "b.jpg"], [network], [0, 0]),
+        external(["a.jpg", "b.jpg"], [network], [0, 0]),
         scanned("a.jpg", "b.jpg", size=(1920, 1080)),
         camera_model="PINHOLE",
     )
     (camera,) = fitted.collection.cameras
     assert (camera.width, camera.height) == (1920, 1080)
     assert camera.params == pytest.approx((400 * 1920 / 518, 400 * 1920 / 518, 960, 540), rel=1e-6)
-    assert any("2 images had intrinsics at another size" in r and "518x294 to 1920x1080" in r for r in fitted.remarks)
+    assert any("2 images had intrinsics at another size" in r and "518x294 to 1920x1080" in r for r in fitted.notes)
 
 
 @pytest.mark.parametrize(("height", "fits"), [(96, True), (104, True), (94, False), (106, False)])
 def test_a_shape_may_differ_by_five_percent(height: int, fits: bool) -> None:
-    model = foreign(["a.jpg", "b.jpg"], [intrinsics(200, height)], [0, 0])
+    model = external(["a.jpg", "b.jpg"], [intrinsics(200, height)], [0, 0])
     if fits:
         assert fit_to_images(model, scanned("a.jpg", "b.jpg", size=(400, 200))).collection.cameras[0].height == 200
         return
@@ -519,43 +517,43 @@ def test_a_shape_may_differ_by_five_percent(height: int, fits: bool) -> None:
 
 def test_a_file_that_exif_turns_is_told_from_a_cropped_one() -> None:
     with pytest.raises(InputError, match=r"is 100x200 px, .* for 200x100 px; .*lying on its side"):
-        fit_to_images(foreign(["a.jpg", "b.jpg"], [intrinsics()], [0, 0]), scanned("a.jpg", "b.jpg", size=(100, 200)))
+        fit_to_images(external(["a.jpg", "b.jpg"], [intrinsics()], [0, 0]), scanned("a.jpg", "b.jpg", size=(100, 200)))
 
 
 def test_one_camera_per_image_becomes_one_camera() -> None:
     cameras = [intrinsics(focal=focal) for focal in (148.0, 150.0, 155.0)]
-    fitted = fit_to_images(foreign(["a.jpg", "b.jpg", "c.jpg"], cameras), scanned("a.jpg", "b.jpg", "c.jpg"))
+    fitted = fit_to_images(external(["a.jpg", "b.jpg", "c.jpg"], cameras), scanned("a.jpg", "b.jpg", "c.jpg"))
     (camera,) = fitted.collection.cameras
     assert camera.focal_px == 150.0
-    assert any("3 cameras with one image each became one" in r and "148 to 155 px" in r for r in fitted.remarks)
+    assert any("3 cameras with one image each became one" in r and "148 to 155 px" in r for r in fitted.notes)
 
 
 def test_cameras_stay_apart_when_that_is_wanted() -> None:
     cameras = [intrinsics(focal=focal) for focal in (148.0, 150.0)]
-    fitted = fit_to_images(foreign(["a.jpg", "b.jpg"], cameras), scanned("a.jpg", "b.jpg"), share_cameras=False)
+    fitted = fit_to_images(external(["a.jpg", "b.jpg"], cameras), scanned("a.jpg", "b.jpg"), share_cameras=False)
     assert [camera.focal_px for camera in fitted.collection.cameras] == [148.0, 150.0]
 
 
 def test_a_zoomed_image_keeps_its_own_camera() -> None:
     cameras = [intrinsics(focal=focal) for focal in (150.0, 151.0, 300.0)]
-    fitted = fit_to_images(foreign(["a.jpg", "b.jpg", "c.jpg"], cameras), scanned("a.jpg", "b.jpg", "c.jpg"))
+    fitted = fit_to_images(external(["a.jpg", "b.jpg", "c.jpg"], cameras), scanned("a.jpg", "b.jpg", "c.jpg"))
     assert [image.camera for image in fitted.collection.images] == [0, 0, 1]
     assert fitted.collection.cameras[1].focal_px == 300.0
 
 
 def test_cameras_that_the_author_shared_are_not_merged_further() -> None:
     names = ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
-    fitted = fit_to_images(foreign(names, [intrinsics(), intrinsics(focal=151.0)], [0, 0, 1, 1]), scanned(*names))
+    fitted = fit_to_images(external(names, [intrinsics(), intrinsics(focal=151.0)], [0, 0, 1, 1]), scanned(*names))
     assert [image.camera for image in fitted.collection.images] == [0, 0, 1, 1]
 
 
 def test_images_of_two_folders_or_lenses_do_not_share_a_camera() -> None:
     cameras = [intrinsics(focal=focal) for focal in (150.0, 151.0)]
-    folders = fit_to_images(foreign(["l/a.jpg", "r/b.jpg"], cameras), scanned("l/a.jpg", "r/b.jpg"))
+    folders = fit_to_images(external(["l/a.jpg", "r/b.jpg"], cameras), scanned("l/a.jpg", "r/b.jpg"))
     assert len(folders.collection.cameras) == 2
     one, other = (scanned(name, tags=CameraTags(make="M", model=name)).records for name in ("a.jpg", "b.jpg"))
     lenses = fit_to_images(
-        foreign(["a.jpg", "b.jpg"], cameras),
+        external(["a.jpg", "b.jpg"], cameras),
         FolderScan(folder=Path("photos"), records=(*one, *other), unreadable=(), other_suffixes={}),
     )
     assert len(lenses.collection.cameras) == 2
@@ -564,22 +562,22 @@ def test_images_of_two_folders_or_lenses_do_not_share_a_camera() -> None:
 def test_one_camera_for_files_of_two_sizes_becomes_two() -> None:
     small, large = scanned("a.jpg").records, scanned("b.jpg", size=(400, 200)).records
     scan = FolderScan(folder=Path("photos"), records=(*small, *large), unreadable=(), other_suffixes={})
-    fitted = fit_to_images(foreign(["a.jpg", "b.jpg"], [intrinsics()], [0, 0]), scan)
+    fitted = fit_to_images(external(["a.jpg", "b.jpg"], [intrinsics()], [0, 0]), scan)
     assert [camera.focal_px for camera in fitted.collection.cameras] == [150.0, 300.0]
 
 
 def test_pinholes_become_radial_unless_asked_otherwise() -> None:
-    model, scan = foreign(["a.jpg", "b.jpg"], [intrinsics()], [0, 0]), scanned("a.jpg", "b.jpg")
+    model, scan = external(["a.jpg", "b.jpg"], [intrinsics()], [0, 0]), scanned("a.jpg", "b.jpg")
     fitted = fit_to_images(model, scan)
     assert fitted.collection.cameras[0].model == "SIMPLE_RADIAL"
     assert fitted.collection.cameras[0].params == (150.0, 100.0, 50.0, 0.0)
-    assert any("pinhole cameras became SIMPLE_RADIAL (1 of 1)" in remark for remark in fitted.remarks)
+    assert any("pinhole cameras became SIMPLE_RADIAL (1 of 1)" in note for note in fitted.notes)
     assert fit_to_images(model, scan, camera_model="PINHOLE").collection.cameras == (intrinsics(),)
 
 
 def test_known_cameras_stay_as_they_are() -> None:
     cameras = [intrinsics(focal=focal) for focal in (148.0, 150.0)]
-    model, scan = foreign(["a.jpg", "b.jpg"], cameras), scanned("a.jpg", "b.jpg")
+    model, scan = external(["a.jpg", "b.jpg"], cameras), scanned("a.jpg", "b.jpg")
     fitted = fit_to_images(model, scan, calibrated=True)
     assert fitted.collection.cameras == tuple(cameras)
     assert fitted.collection.calibrated
@@ -588,7 +586,7 @@ def test_known_cameras_stay_as_they_are() -> None:
 
 
 def test_distortion_is_carried_into_a_larger_model() -> None:
-    model = foreign(["a.jpg", "b.jpg"], [intrinsics(model="SIMPLE_RADIAL")], [0, 0])
+    model = external(["a.jpg", "b.jpg"], [intrinsics(model="SIMPLE_RADIAL")], [0, 0])
     fitted = fit_to_images(model, scanned("a.jpg", "b.jpg"), camera_model="OPENCV")
     assert fitted.collection.cameras[0].params == (150.0, 150.0, 100.0, 50.0, 0.01, 0.0, 0.0, 0.0)
     assert fit_to_images(model, scanned("a.jpg", "b.jpg")).collection.cameras[0].model == "SIMPLE_RADIAL"
@@ -597,7 +595,7 @@ def test_distortion_is_carried_into_a_larger_model() -> None:
 def test_a_fisheye_cannot_become_a_perspective_camera() -> None:
     fisheye = Intrinsics(model="OPENCV_FISHEYE", width=200, height=100, params=(90, 90, 100, 50, 0, 0, 0, 0))
     with pytest.raises(ConfigError, match=r"--camera-model OPENCV: a camera of the model is OPENCV_FISHEYE"):
-        fit_to_images(foreign(["a.jpg", "b.jpg"], [fisheye], [0, 0]), scanned("a.jpg", "b.jpg"), camera_model="OPENCV")
+        fit_to_images(external(["a.jpg", "b.jpg"], [fisheye], [0, 0]), scanned("a.jpg", "b.jpg"), camera_model="OPENCV")
 
 
 def test_observations_follow_their_images_into_the_new_order(tmp_path: Path) -> None:

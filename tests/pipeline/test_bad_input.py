@@ -18,7 +18,7 @@ from smust3r_colmap.config import RunConfig, SegmentationConfig, TransformGroup
 from smust3r_colmap.evaluation.trajectory import Evaluation, compare_trajectories
 from smust3r_colmap.geometry.arrays import Float32Array
 from smust3r_colmap.geometry.sim3 import Sim3
-from smust3r_colmap.products import DenseMaps, Segment, SegmentAlignment, SegmentPiece, SegmentReconstruction
+from smust3r_colmap.products import DenseMaps, Segment, SegmentAlignment, SegmentReconstruction, Submodel
 from smust3r_colmap.segmentation.loop_segments import PlannedLoop
 from smust3r_colmap.stitching.stitch import stitch
 from smust3r_colmap.synthetic.backbone import OracleBackbone
@@ -53,7 +53,7 @@ class SomeViews:
 
 @dataclass(frozen=True, eq=False)
 class SpoiltMaps:
-    """Maps of some images of a piece, changed on their way out."""
+    """Maps of some images of a submodel, changed on their way out."""
 
     maps: DenseMaps
     chosen: tuple[int, ...]
@@ -126,21 +126,21 @@ def simulated(truth: TrueScene, config: RunConfig = CONFIG, settings: OracleSett
     return Run(truth=truth, config=config, result=result, loops=plan.loops, segments=segments)
 
 
-def spoilt(run: Run, change: Change, pieces: Sequence[int] | None = None) -> Run:
-    """The run with the maps (points, depth, confidence) of some pieces, or all, changed."""
+def spoilt(run: Run, change: Change, submodels: Sequence[int] | None = None) -> Run:
+    """The run with the maps (points, depth, confidence) of some submodels, or all, changed."""
     dense = tuple(
-        SpoiltMaps(maps, tuple(range(len(maps))), change) if pieces is None or number in pieces else maps
+        SpoiltMaps(maps, tuple(range(len(maps))), change) if submodels is None or number in submodels else maps
         for number, maps in enumerate(run.result.dense)
     )
     return replace(run, result=replace(run.result, dense=dense))
 
 
-def with_piece(run: Run, number: int, piece: SegmentPiece, maps: DenseMaps) -> Run:
-    """The run with another piece of the same segment in its place."""
-    (before,) = run.result.reconstructions[number].pieces
-    assert before.segment == piece.segment
+def with_submodel(run: Run, number: int, submodel: Submodel, maps: DenseMaps) -> Run:
+    """The run with another submodel of the same segment in its place."""
+    (before,) = run.result.reconstructions[number].submodels
+    assert before.segment == submodel.segment
     reconstructions: list[SegmentReconstruction] = list(run.result.reconstructions)
-    reconstructions[number] = replace(reconstructions[number], pieces=(piece,))
+    reconstructions[number] = replace(reconstructions[number], submodels=(submodel,))
     dense = list(run.result.dense)
     dense[number] = maps
     result = replace(run.result, reconstructions=tuple(reconstructions), dense=tuple(dense))
@@ -171,7 +171,7 @@ def test_an_unspoilt_round_is_sound_and_its_loop_closes(
 ) -> None:
     run, solved = once_round, solved_round
     assert_sound(run, solved)
-    assert [verdict.accepted for verdict in solved.stitching.verdicts] == [True]
+    assert [decision.accepted for decision in solved.stitching.decisions] == [True]
     assert len(solved.stitching.parts) == 1
     chained = compare_trajectories(solved.before, dict(zip(truth.names, truth.world_from_cam, strict=True)))
     assert judged(run, solved).position_rmse < 0.9 * chained.position_rmse
@@ -182,7 +182,7 @@ def test_a_path_that_never_comes_back_plans_no_loop(truth: TrueScene) -> None:
     assert run.loops == ()
     solved = run.solved()
     assert_sound(run, solved)
-    assert solved.stitching.verdicts == ()
+    assert solved.stitching.decisions == ()
 
 
 def test_a_camera_that_stands_still_is_chained_by_its_points_and_closes_nothing(truth: TrueScene) -> None:
@@ -208,7 +208,7 @@ def test_one_common_camera_is_enough_for_points_and_too_little_for_poses(
     run = simulated(truth, config)
     solved = run.solved()
     assert_sound(run, solved, percent=6.0, angle_deg=max_angle_deg)
-    assert any("pieces 0 and 1 share one camera (image 15)" in reason for reason in reasons(solved))
+    assert any("submodels 0 and 1 share one camera (image 15)" in reason for reason in reasons(solved))
 
     poses_alone = replace(run, config=replace(config, alignment=replace(config.alignment, alignment_edges="poses")))
     assert len(poses_alone.solved().stitching.parts) == 3
@@ -216,7 +216,7 @@ def test_one_common_camera_is_enough_for_points_and_too_little_for_poses(
 
 def test_segments_without_a_common_image_become_parts_that_are_solved_each_by_itself(truth: TrueScene) -> None:
     run = simulated(truth, WITHOUT_LOOPS)
-    last = run.result.pieces[3]
+    last = run.result.submodels[3]
     half = tuple(range(8, 16))  # what it shares with the next one, so nothing with the one before
     cut = replace(
         last,
@@ -224,9 +224,9 @@ def test_segments_without_a_common_image_become_parts_that_are_solved_each_by_it
         seg_from_cam=last.seg_from_cam[list(half)],
         intrinsics=tuple(last.intrinsics[k] for k in half),
     )
-    run = with_piece(run, 3, cut, SpoiltMaps(run.result.dense[3], half, lambda *maps: maps))
+    run = with_submodel(run, 3, cut, SpoiltMaps(run.result.dense[3], half, lambda *maps: maps))
     solved = run.solved()
-    assert [part.pieces for part in solved.stitching.parts] == [(0, 1, 2), (3, 4, 5, 6)]
+    assert [part.submodels for part in solved.stitching.parts] == [(0, 1, 2), (3, 4, 5, 6)]
     loops: frozenset[int] = frozenset()
     for part in solved.stitching.parts:
         np.testing.assert_allclose(part.world_from_seg[0].matrix, np.eye(4), atol=1e-12)
@@ -267,10 +267,10 @@ def test_negative_depth_is_taken_for_none(once_round: Run) -> None:
     ],
 )
 def test_a_segment_without_geometry_stays_alone_and_the_rest_is_sound(once_round: Run, change: Change) -> None:
-    run = spoilt(once_round, change, pieces=[2])
+    run = spoilt(once_round, change, submodels=[2])
     solved = run.solved()
     assert_sound(run, solved)
-    assert {part.pieces for part in solved.stitching.parts} == {(0, 1, 3, 4, 5, 6, 7), (2,)}
+    assert {part.submodels for part in solved.stitching.parts} == {(0, 1, 3, 4, 5, 6, 7), (2,)}
     assert any("no depth anywhere" in reason or "0 point pairs" in reason for reason in reasons(solved))
 
 
@@ -279,8 +279,8 @@ def test_without_geometry_anywhere_nothing_is_joined(once_round: Run) -> None:
     solved = run.solved()
     assert solved.edges.alignments == ()
     assert len(solved.stitching.parts) == 7
-    (verdict,) = solved.stitching.verdicts
-    assert "no sound edge" in verdict.reason
+    (decision,) = solved.stitching.decisions
+    assert "no sound edge" in decision.reason
 
 
 @pytest.mark.parametrize("value", [1.5, 5.0, 1e6])
@@ -303,22 +303,22 @@ def test_without_confidence_the_cameras_carry_the_chain(once_round: Run, value: 
 # -------------------------------------------------------------------------- contradictions
 def test_cameras_that_deny_the_points_of_their_segment_are_not_believed(truth: TrueScene) -> None:
     run = simulated(truth, WITHOUT_LOOPS)
-    piece = run.result.pieces[2]
-    stretched = piece.seg_from_cam.copy()
+    submodel = run.result.submodels[2]
+    stretched = submodel.seg_from_cam.copy()
     stretched[:, :, 3] *= 1.5
-    run = with_piece(run, 2, replace(piece, seg_from_cam=stretched), run.result.dense[2])
+    run = with_submodel(run, 2, replace(submodel, seg_from_cam=stretched), run.result.dense[2])
     solved = run.solved()
     assert any("it denies the edge from pointmaps" in reason for reason in reasons(solved))
     assert len(solved.stitching.parts) == 1
 
 
 def test_points_of_another_place_are_refused_and_so_are_the_cameras_beside_them(once_round: Run) -> None:
-    run = with_piece(once_round, 2, once_round.result.pieces[2], once_round.result.dense[5])
+    run = with_submodel(once_round, 2, once_round.result.submodels[2], once_round.result.dense[5])
     solved = run.solved()
     assert_sound(run, solved)
     assert any("of the depth, at most 0.05" in reason for reason in reasons(solved))
     assert "the points of the same images were refused" in reasons(solved)
-    assert (2,) in {part.pieces for part in solved.stitching.parts}
+    assert (2,) in {part.submodels for part in solved.stitching.parts}
 
 
 def test_trusted_edges_that_contradict_each_other_end_in_a_finite_compromise(truth: TrueScene) -> None:
@@ -328,7 +328,7 @@ def test_trusted_edges_that_contradict_each_other_end_in_a_finite_compromise(tru
     alignments = list(solved.edges.alignments)
     position = next(k for k, edge in enumerate(alignments) if edge.source - edge.target == 2)
     alignments[position] = _turned(alignments[position])
-    found = stitch(run.result.pieces, alignments, (), group=Sim3, kernel="cauchy")
+    found = stitch(run.result.submodels, alignments, (), group=Sim3, kernel="cauchy")
     assert found.solution.cost_after < found.solution.cost_before
     assert found.solution.cost_after > 10 * solved.stitching.solution.cost_after
     (part,) = found.parts

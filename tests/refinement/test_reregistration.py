@@ -228,7 +228,7 @@ def test_refinement_straightens_a_bend_and_keeps_the_scale(world: World, tmp_pat
     )
     (figures,) = refine_scenes(task)
     assert "images placed again" in [step.name for step in figures.steps if step.kept]
-    assert figures.doubts == ()
+    assert figures.warnings == ()
     model = pycolmap.Reconstruction(tmp_path / "refined/0/model")
     distance, turn = off_by(world, poses_of(model))
     assert distance < 0.004

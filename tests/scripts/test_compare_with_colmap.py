@@ -22,10 +22,10 @@ from comparison_figures import (
     Result,
     Verdict,
     costs_by_stage,
+    decisions,
     figures_of,
     find_jumps,
     untrue_jumps,
-    verdicts,
 )
 from comparison_report import as_json, render_markdown, render_stages, render_table
 from helpers.scenes import rotation_about_y, walk
@@ -76,14 +76,14 @@ EQUAL = Result(
     figures=figures(),
     evaluation=compare_trajectories(disturbed(0.01), TRUTH),
     jumps=(),
-    remark="",
+    note="",
     workers=2,
     stages={},
 )
 
 
 def judged(ours: Result, *mappers: Result, of: Dataset | None = None) -> dict[str, Verdict]:
-    return {one.figure: one for one in verdicts(of or dataset(), ours, mappers)}
+    return {one.figure: one for one in decisions(of or dataset(), ours, mappers)}
 
 
 # ------------------------------------------------------------------------------ figures
@@ -181,7 +181,7 @@ def test_every_stage_but_those_named_is_mapping() -> None:
     assert sum(one.cpu_s for one in costs.values()) == pytest.approx(total)
 
 
-# ----------------------------------------------------------------------------- verdicts
+# ----------------------------------------------------------------------------- decisions
 def test_as_good_as_colmap_meets_everything() -> None:
     found = judged(EQUAL, replace(EQUAL, method=INCREMENTAL), replace(EQUAL, method=GLOBAL))
     assert all(one.met is not False for one in found.values())
@@ -252,7 +252,7 @@ def test_each_figure_has_the_better_mapper_for_a_yardstick() -> None:
     "failed",
     [
         {"registered_largest": NUM_IMAGES // 2 - 1},
-        {"evaluation": None, "remark": "nothing in common"},
+        {"evaluation": None, "note": "nothing in common"},
     ],
 )
 def test_a_mapper_that_failed_is_no_yardstick_but_for_its_images(failed: Mapping[str, object]) -> None:
@@ -312,8 +312,8 @@ def test_json_can_be_read_by_strict_readers() -> None:
     results[2] = replace(results[2], figures=figures(error_px=math.nan))
     records = json.loads(json.dumps(as_json(dataset(), results), allow_nan=False))
     assert records[2]["figures"]["reprojection_error_px"] is None
-    assert {one["figure"] for one in records[0]["verdicts"]} >= {"registered", "track length"}
-    assert records[1]["verdicts"] == []
+    assert {one["figure"] for one in records[0]["decisions"]} >= {"registered", "track length"}
+    assert records[1]["decisions"] == []
     assert "reference_from_estimated" not in records[0]["evaluation"]
 
 
@@ -505,5 +505,5 @@ def test_one_camera_for_all_lies_apart_from_a_camera_per_image(finished: Path, m
     monkeypatch.setattr(compare, "run_child", record)
     results = run_script(finished, monkeypatch, "--reuse", "--skip-ours", "--skip-global", "--cameras", "single")
     assert stages == [f"{stage} colmap_single single" for stage in ("features", "matching", "incremental")]
-    assert results[INCREMENTAL].remark == "no model"
+    assert results[INCREMENTAL].note == "no model"
     assert results[INCREMENTAL].evaluation is None

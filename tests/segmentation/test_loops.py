@@ -177,8 +177,8 @@ def test_standing_for_a_while_is_not_coming_back(similarity: float) -> None:
     places = np.concatenate([straight(100), np.full(250, 100.0), 101 + straight(150)])
     found = plan(see(places, noise=0.5), similarity=similarity)
     assert found.loops == ()
-    verdicts = Counter(one.reason for one in found.candidates)
-    assert verdicts["the camera did not leave the place in between"] >= 5
+    decisions = Counter(one.reason for one in found.candidates)
+    assert decisions["the camera did not leave the place in between"] >= 5
 
 
 def test_unordered_images_are_not_searched() -> None:

@@ -319,7 +319,7 @@ def test_long_chain_with_drift_of_a_sixth_of_its_size_keeps_its_true_loops() -> 
 
 
 @pytest.mark.parametrize("factor", [1 / 9, 9.0])
-def test_information_wrong_by_a_factor_of_nine_changes_no_verdict(factor: float) -> None:
+def test_information_wrong_by_a_factor_of_nine_changes_no_decision(factor: float) -> None:
     _, graph, start, wrong = measured_ring(201, 40, 12)
     found = optimise(replace(graph, information=factor * graph.information), start)
     assert found.rejected_loops.tolist() == wrong.tolist()

@@ -3,7 +3,7 @@ from helpers.scenes import some_sim3
 
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.products import SegmentAlignment, TransformEstimate
-from smust3r_colmap.stitching.spanning_tree import chain_pieces
+from smust3r_colmap.stitching.spanning_tree import chain_submodels
 
 
 def edge(
@@ -37,8 +37,8 @@ def exact_edges(world_from_seg: list[Sim3], pairs: list[tuple[int, int]]) -> lis
 def test_a_chain_gives_back_the_frames_it_was_made_from() -> None:
     rng = np.random.default_rng(0)
     truth = [Sim3.identity(), *[some_sim3(rng) for _ in range(4)]]
-    (part,) = chain_pieces(range(5), exact_edges(truth, [(0, 1), (1, 2), (2, 3), (3, 4)]))
-    assert part.pieces == (0, 1, 2, 3, 4)
+    (part,) = chain_submodels(range(5), exact_edges(truth, [(0, 1), (1, 2), (2, 3), (3, 4)]))
+    assert part.submodels == (0, 1, 2, 3, 4)
     for found, wanted in zip(part.world_from_seg, truth, strict=True):
         np.testing.assert_allclose(found.matrix, wanted.matrix, rtol=0, atol=1e-9)
 
@@ -46,12 +46,12 @@ def test_a_chain_gives_back_the_frames_it_was_made_from() -> None:
 def test_an_edge_may_point_either_way() -> None:
     rng = np.random.default_rng(1)
     truth = [Sim3.identity(), some_sim3(rng), some_sim3(rng)]
-    (part,) = chain_pieces(range(3), exact_edges(truth, [(1, 0), (2, 1)]))
+    (part,) = chain_submodels(range(3), exact_edges(truth, [(1, 0), (2, 1)]))
     for found, wanted in zip(part.world_from_seg, truth, strict=True):
         np.testing.assert_allclose(found.matrix, wanted.matrix, rtol=0, atol=1e-9)
 
 
-def test_pieces_without_an_accepted_edge_stay_apart() -> None:
+def test_submodels_without_an_accepted_edge_stay_apart() -> None:
     rng = np.random.default_rng(2)
     truth = [Sim3.identity(), some_sim3(rng), Sim3.identity(), some_sim3(rng)]
     edges = [
@@ -59,8 +59,8 @@ def test_pieces_without_an_accepted_edge_stay_apart() -> None:
         edge(1, 2, some_sim3(rng), accepted=False),
         edge(2, 3, truth[3]),
     ]
-    first, second = chain_pieces(range(4), edges)
-    assert (first.pieces, second.pieces) == ((0, 1), (2, 3))
+    first, second = chain_submodels(range(4), edges)
+    assert (first.submodels, second.submodels) == ((0, 1), (2, 3))
     np.testing.assert_allclose(second.world_from_seg[0].matrix, np.eye(4))
     np.testing.assert_allclose(second.world_from_seg[1].matrix, truth[3].matrix, atol=1e-9)
 
@@ -71,14 +71,14 @@ def test_the_chain_prefers_edges_with_more_and_better_inliers() -> None:
     good = exact_edges(truth, [(0, 1), (1, 2)])
     weak = edge(0, 2, some_sim3(rng), inliers=20)
     loose = edge(0, 2, some_sim3(rng), inliers=110, residual=0.04)
-    (part,) = chain_pieces(range(3), [weak, *good, loose])
+    (part,) = chain_submodels(range(3), [weak, *good, loose])
     assert part.edges == (1, 2)
     np.testing.assert_allclose(part.world_from_seg[2].matrix, truth[2].matrix, atol=1e-9)
 
 
-def test_a_single_piece_is_its_own_world() -> None:
-    (part,) = chain_pieces(range(1), [])
-    assert part.pieces == (0,)
+def test_a_single_submodel_is_its_own_world() -> None:
+    (part,) = chain_submodels(range(1), [])
+    assert part.submodels == (0,)
     np.testing.assert_array_equal(part.world_from_seg[0].matrix, np.eye(4))
 
 
@@ -87,14 +87,14 @@ def test_the_chain_runs_through_a_loop_only_where_nothing_else_connects() -> Non
     truth = [Sim3.identity(), *[some_sim3(rng) for _ in range(4)]]
     weak = edge(0, 1, truth[1], inliers=20, residual=0.04)
     strong = [edge(0, 4, truth[4], inliers=5000), edge(1, 4, some_sim3(rng), inliers=5000)]
-    (part,) = chain_pieces([0, 1, 4], [weak, *strong], loops={4})
+    (part,) = chain_submodels([0, 1, 4], [weak, *strong], loops={4})
     np.testing.assert_allclose(part.world_from_seg[1].matrix, truth[1].matrix, atol=1e-9)
-    (bridged,) = chain_pieces([0, 1, 4], strong, loops={4})
-    assert bridged.pieces == (0, 1, 4)
+    (bridged,) = chain_submodels([0, 1, 4], strong, loops={4})
+    assert bridged.submodels == (0, 1, 4)
 
 
-def test_pieces_that_take_no_part_leave_no_trace() -> None:
+def test_submodels_that_take_no_part_leave_no_trace() -> None:
     rng = np.random.default_rng(5)
     edges = [edge(0, 1, some_sim3(rng)), edge(1, 2, some_sim3(rng))]
-    first, second = chain_pieces([0, 2], edges)
-    assert (first.pieces, second.pieces) == ((0,), (2,))
+    first, second = chain_submodels([0, 2], edges)
+    assert (first.submodels, second.submodels) == ((0,), (2,))

@@ -20,13 +20,13 @@ from smust3r_colmap.products import (
     ImageCollection,
     Segment,
     SegmentAlignment,
-    SegmentPiece,
     SegmentReconstruction,
+    Submodel,
     TransformEstimate,
 )
 from smust3r_colmap.segmentation.loop_segments import PlannedLoop
 from smust3r_colmap.stitching import stitch as stitching
-from smust3r_colmap.stitching.loop_verification import LoopVerdict, UncertainTransform, covariance_of
+from smust3r_colmap.stitching.loop_verification import LoopDecision, UncertainTransform, covariance_of
 from smust3r_colmap.stitching.pose_graph.graph import PoseGraph
 from smust3r_colmap.stitching.pose_graph.optimise import GraphSolution, optimise
 from smust3r_colmap.stitching.stitch import ClosureGap, Stitching, closure_gap, stitch
@@ -46,27 +46,27 @@ def world_from_cam_on_ring(image: int) -> np.ndarray:
 
 
 class Ring:
-    """Pieces in gauges of their own, exact in themselves; the edges between them are measured with noise."""
+    """Submodels in gauges of their own, exact in themselves; the edges between them are measured with noise."""
 
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
         self.seg_from_world: list[Sim3] = []
-        self.pieces: list[SegmentPiece] = []
+        self.submodels: list[Submodel] = []
         self.edges: list[SegmentAlignment] = []
         self.loops: list[PlannedLoop] = []
         for number, first in enumerate(range(0, NUM_IMAGES - LENGTH + 1, STEP)):
-            self.add_piece(tuple(range(first, first + LENGTH)), number)
+            self.add_submodel(tuple(range(first, first + LENGTH)), number)
             if number:
                 self.add_edge(number - 1, number)
 
-    def add_piece(self, images: tuple[int, ...], segment: int) -> int:
-        seg_from_world = Sim3.identity() if not self.pieces else some_sim3(self.rng)
+    def add_submodel(self, images: tuple[int, ...], segment: int) -> int:
+        seg_from_world = Sim3.identity() if not self.submodels else some_sim3(self.rng)
         world_from_cam = np.array([world_from_cam_on_ring(image) for image in images])
         self.seg_from_world.append(seg_from_world)
-        self.pieces.append(
-            SegmentPiece(
+        self.submodels.append(
+            Submodel(
                 segment=segment,
-                piece=sum(piece.segment == segment for piece in self.pieces),
+                submodel=sum(submodel.segment == segment for submodel in self.submodels),
                 images=images,
                 seg_from_cam=seg_from_world.move_cameras(world_from_cam),
                 intrinsics=(CAMERA,) * len(images),
@@ -75,7 +75,7 @@ class Ring:
                 tracks=None,
             )
         )
-        return len(self.pieces) - 1
+        return len(self.submodels) - 1
 
     def add_edge(self, target: int, source: int, *, wrong: Sim3 | None = None) -> None:
         """Measured with noise in the world's unit, about the source's place in the world."""
@@ -107,10 +107,12 @@ class Ring:
             )
         )
 
-    def add_loop(self, a: int, b: int, *, wrong: Sim3 | None = None, pieces: int = 1) -> None:
+    def add_loop(self, a: int, b: int, *, wrong: Sim3 | None = None, submodels: int = 1) -> None:
         """Between the windows a and b; a wrong one is bent between its ends."""
-        ends = self.pieces[a].images[4:9], self.pieces[b].images[4:9]
-        segment = Segment(index=1 + max(piece.segment for piece in self.pieces), images=ends[0] + ends[1], kind="loop")
+        ends = self.submodels[a].images[4:9], self.submodels[b].images[4:9]
+        segment = Segment(
+            index=1 + max(submodel.segment for submodel in self.submodels), images=ends[0] + ends[1], kind="loop"
+        )
         self.loops.append(
             PlannedLoop(
                 segment=segment,
@@ -121,24 +123,24 @@ class Ring:
                 similarity=0.9,
             )
         )
-        if pieces == 1:
-            loop = self.add_piece(segment.images, segment.index)
+        if submodels == 1:
+            loop = self.add_submodel(segment.images, segment.index)
             self.add_edge(a, loop)
             self.add_edge(b, loop, wrong=wrong)
-        elif pieces == 2:
+        elif submodels == 2:
             for window, end in zip((a, b), ends, strict=True):
-                self.add_edge(window, self.add_piece(end, segment.index))
+                self.add_edge(window, self.add_submodel(end, segment.index))
 
     def stitched(self) -> Stitching:
-        return stitch(self.pieces, self.edges, self.loops, group=Sim3, kernel="cauchy")
+        return stitch(self.submodels, self.edges, self.loops, group=Sim3, kernel="cauchy")
 
     def error(self, stitching: Stitching, *, closed: bool) -> float:
-        """Root mean square distance of all window cameras from the truth, the first piece held."""
+        """Root mean square distance of all window cameras from the truth, the first submodel held."""
         (part,) = stitching.parts if closed else stitching.chained
         squared = []
-        for piece, frame in zip(part.pieces, part.world_from_seg, strict=True):
-            truth = np.array([world_from_cam_on_ring(image)[:, 3] for image in self.pieces[piece].images])
-            squared += list(((frame.apply(self.pieces[piece].seg_from_cam[:, :, 3]) - truth) ** 2).sum(axis=1))
+        for submodel, frame in zip(part.submodels, part.world_from_seg, strict=True):
+            truth = np.array([world_from_cam_on_ring(image)[:, 3] for image in self.submodels[submodel].images])
+            squared += list(((frame.apply(self.submodels[submodel].seg_from_cam[:, :, 3]) - truth) ** 2).sum(axis=1))
         return float(np.sqrt(np.mean(squared)))
 
 
@@ -153,9 +155,9 @@ def test_a_true_loop_is_closed_and_brings_the_frames_nearer_to_the_truth() -> No
         ring = Ring(seed)
         ring.add_loop(0, 10)
         found = ring.stitched()
-        (verdict,) = found.verdicts
-        assert verdict.accepted, verdict.reason
-        assert verdict.closure_sigmas < 2.5
+        (decision,) = found.decisions
+        assert decision.accepted, decision.reason
+        assert decision.closure_sigmas < 2.5
         gaps += found.gaps
         before.append(ring.error(found, closed=False))
         after.append(ring.error(found, closed=True))
@@ -168,10 +170,10 @@ def test_a_loop_that_contradicts_the_chain_beyond_its_uncertainty_is_refused() -
     ring = Ring(0)
     ring.add_loop(0, 6, wrong=FAR_OFF)
     found = ring.stitched()
-    (verdict,) = found.verdicts
-    assert not verdict.accepted
-    assert verdict.closure_sigmas > 5
-    assert f"contradicts the chain of windows by {verdict.closure_sigmas:.1f} standard deviations" in verdict.reason
+    (decision,) = found.decisions
+    assert not decision.accepted
+    assert decision.closure_sigmas > 5
+    assert f"contradicts the chain of windows by {decision.closure_sigmas:.1f} standard deviations" in decision.reason
     assert ring.error(found, closed=True) == pytest.approx(ring.error(found, closed=False), rel=1e-6)
 
 
@@ -183,32 +185,32 @@ def test_a_loop_wrong_within_the_uncertainty_of_the_chain_is_outvoted_in_the_gra
     somewhat_off = Sim3.exp(15 * SIGMA * np.array([1, -1, 1, 1, -1, 1, 1]))
     ring.add_loop(1, 9, wrong=somewhat_off)
     found = ring.stitched()
-    assert [verdict.accepted for verdict in found.verdicts] == [True, True, True, False]
-    assert "the other edges of the graph contradict it" in found.verdicts[3].reason
-    assert found.verdicts[3].closure_sigmas < 5
-    assert len(found.parts[0].pieces) == 11 + 3
+    assert [decision.accepted for decision in found.decisions] == [True, True, True, False]
+    assert "the other edges of the graph contradict it" in found.decisions[3].reason
+    assert found.decisions[3].closure_sigmas < 5
+    assert len(found.parts[0].submodels) == 11 + 3
     assert ring.error(found, closed=True) < 1.1 * true_alone
 
 
 def test_a_loop_segment_that_fell_apart_proves_nothing() -> None:
     ring = Ring(2)
-    ring.add_loop(0, 10, pieces=2)
-    ring.add_loop(1, 10, pieces=0)
+    ring.add_loop(0, 10, submodels=2)
+    ring.add_loop(1, 10, submodels=0)
     found = ring.stitched()
-    assert [verdict.accepted for verdict in found.verdicts] == [False, False]
-    assert "holds 3 images of both ends (pieces of 5 + 0, 0 + 5)" in found.verdicts[0].reason
-    assert found.verdicts[1].reason == "nothing came out of the loop segment"
-    assert found.parts[0].pieces == tuple(range(11))
+    assert [decision.accepted for decision in found.decisions] == [False, False]
+    assert "holds 3 images of both ends (submodels of 5 + 0, 0 + 5)" in found.decisions[0].reason
+    assert found.decisions[1].reason == "nothing came out of the loop segment"
+    assert found.parts[0].submodels == tuple(range(11))
 
 
 def test_a_loop_needs_a_sound_edge_at_both_ends() -> None:
     ring = Ring(3)
     ring.add_loop(0, 10)
     ring.edges[-1] = replace(ring.edges[-1], accepted=False, reason="median residual is 0.300 of the depth")
-    (verdict,) = ring.stitched().verdicts
-    assert not verdict.accepted
-    assert "no sound edge between the loop segment and a window of the second end" in verdict.reason
-    assert "median residual is 0.300" in verdict.reason
+    (decision,) = ring.stitched().decisions
+    assert not decision.accepted
+    assert "no sound edge between the loop segment and a window of the second end" in decision.reason
+    assert "median residual is 0.300" in decision.reason
 
 
 def test_a_loop_joins_parts_that_the_sequence_does_not() -> None:
@@ -216,10 +218,10 @@ def test_a_loop_joins_parts_that_the_sequence_does_not() -> None:
     del ring.edges[4]
     ring.add_loop(0, 10)
     found = ring.stitched()
-    assert [len(part.pieces) for part in found.chained] == [5, 6]
+    assert [len(part.submodels) for part in found.chained] == [5, 6]
     (part,) = found.parts
-    assert len(part.pieces) == 12
-    assert np.isnan(found.verdicts[0].closure_sigmas)
+    assert len(part.submodels) == 12
+    assert np.isnan(found.decisions[0].closure_sigmas)
     assert np.isnan(found.gaps[0][0].distance)
     assert ring.error(found, closed=True) < 0.5
 
@@ -233,16 +235,16 @@ def test_a_loop_that_the_graph_could_not_use_is_not_called_closed(monkeypatch: p
     ring = Ring(0)
     ring.add_loop(0, 10)
     found = ring.stitched()
-    (verdict,) = found.verdicts
-    assert not verdict.accepted
-    assert verdict.reason == "the pose graph kept the chain of windows: stuck"
-    assert found.parts[0].pieces == tuple(range(11))
+    (decision,) = found.decisions
+    assert not decision.accepted
+    assert decision.reason == "the pose graph kept the chain of windows: stuck"
+    assert found.parts[0].submodels == tuple(range(11))
 
 
 def test_without_loops_the_chain_stays_as_it_is() -> None:
     ring = Ring(5)
     found = ring.stitched()
-    assert found.verdicts == ()
+    assert found.decisions == ()
     for chained, placed in zip(found.chained[0].world_from_seg, found.parts[0].world_from_seg, strict=True):
         np.testing.assert_allclose(chained.matrix, placed.matrix, rtol=1e-9, atol=1e-9)
 
@@ -257,7 +259,7 @@ def test_two_edges_of_a_pair_are_averaged_by_their_information() -> None:
         estimate=replace(first.estimate, b_from_a=first.estimate.b_from_a @ shifted),
         information=first.information / 2,
     )
-    found = stitch(ring.pieces[:2], [first, second], [], group=Sim3, kernel="cauchy")
+    found = stitch(ring.submodels[:2], [first, second], [], group=Sim3, kernel="cauchy")
     between = first.estimate.b_from_a.inverse() @ found.parts[0].world_from_seg[1]
     np.testing.assert_allclose(between.log(), [0.001, 0, 0, 0, 0, 0, 0], atol=1e-6)
 
@@ -305,36 +307,38 @@ def test_a_loop_whose_scale_nothing_knows_is_not_refused_for_its_scale() -> None
         carry = ring.seg_from_world[edge.source].inverse().adjoint()
         unscaled = carry.T @ np.diag([*1 / SIGMA[:6] ** 2, 0]) @ carry
         ring.edges[position] = replace(edge, information=unscaled)
-    assert ring.stitched().verdicts[0].closure_sigmas < 2.5
+    assert ring.stitched().decisions[0].closure_sigmas < 2.5
 
 
 def test_the_gap_of_a_camera_that_only_turns_has_no_distance() -> None:
     ring = Ring(9)
     ring.add_loop(0, 10)
-    pieces = [replace(piece, seg_from_cam=piece.seg_from_cam * [1, 1, 1, 0]) for piece in ring.pieces]
+    submodels = [replace(submodel, seg_from_cam=submodel.seg_from_cam * [1, 1, 1, 0]) for submodel in ring.submodels]
     same = [replace(edge.estimate, b_from_a=Sim3.identity()) for edge in ring.edges]
     edges = [replace(edge, estimate=estimate) for edge, estimate in zip(ring.edges, same, strict=True)]
-    (part,) = stitch(pieces[:-1], edges[:-2], [], group=Sim3, kernel="none").chained
-    verdict = LoopVerdict(piece=11, accepted=True, edges=(10, 11))
-    assert np.isnan(closure_gap(verdict, pieces, edges, [part]).distance)
+    (part,) = stitch(submodels[:-1], edges[:-2], [], group=Sim3, kernel="none").chained
+    decision = LoopDecision(submodel=11, accepted=True, edges=(10, 11))
+    assert np.isnan(closure_gap(decision, submodels, edges, [part]).distance)
 
 
 def test_a_chain_that_cannot_be_drawn_costs_the_comparison_and_not_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     ring = Ring(0)
     ring.add_loop(0, 10)
     found = ring.stitched()
-    assert found.verdicts[0].accepted
+    assert found.decisions[0].accepted
     reconstructions = tuple(
-        SegmentReconstruction(segment=piece.segment, pieces=(piece,), unregistered=(), attempts=(), metric=False)
-        for piece in ring.pieces
+        SegmentReconstruction(
+            segment=submodel.segment, submodels=(submodel,), unregistered=(), attempts=(), metric=False
+        )
+        for submodel in ring.submodels
     )
-    maps = tuple(EmptyMaps(piece, longer_side=8) for piece in ring.pieces)
+    maps = tuple(EmptyMaps(submodel, longer_side=8) for submodel in ring.submodels)
     result = BackboneResult(reconstructions=reconstructions, dense=maps, dense_key="", links=None, rejected=())
 
     def beyond_infinity(*_: object) -> None:
         raise DegenerateAlignmentError("2 of 16 cameras lie beyond the plane that the transform sends to infinity")
 
-    monkeypatch.setattr(pipeline, "_placed_pieces", beyond_infinity)
+    monkeypatch.setattr(pipeline, "_placed_submodels", beyond_infinity)
     clock = StageClock(QuietReporter(sys.stderr))
     collection = ImageCollection(images=(), cameras=())
     assert pipeline._without_loops(result, (), found, collection, clock) is None

@@ -63,7 +63,7 @@ def seen_from(
         ([0, 0, 1], [0.0, 0.9, 1.45], 1.55),  # the ceiling is 3 m high
         ([0, 0, -1], [0.0, 0.0, 1.45], 1.45),  # the floor
         ([0, 0, -1], [-0.5, 1.55, 1.0], 0.58),  # the seat of the sofa, 0.42 m high
-        ([0, 1, 0], [0.9, 0.0, 2.5], 2.0),  # a bare piece of wall
+        ([0, 1, 0], [0.9, 0.0, 2.5], 2.0),  # a bare submodel of wall
         ([0, -1, 0], [0.0, 0.0, 1.0], 1.6),  # the bookcase, 0.4 m deep
         ([1, 0, 0], [0.0, -0.1, 0.5], 2.6),  # the sideboard, 0.4 m deep
     ],

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.alignment.from_pointmaps import align_pointmaps
-from smust3r_colmap.alignment.seen_points import PieceFit
+from smust3r_colmap.alignment.seen_points import SubmodelFit
 from smust3r_colmap.backbones.base import Backbone
 from smust3r_colmap.config import AlignmentConfig
 from smust3r_colmap.errors import CollectionError, ConfigError, DegenerateAlignmentError, ImageError, InputError
@@ -50,22 +50,22 @@ def oracle(truth: TrueScene, settings: OracleSettings, seed: int = 0) -> OracleB
     return OracleBackbone(truth, collection_of(truth), settings, seed)
 
 
-def one_piece(truth: TrueScene, settings: OracleSettings, segment: Segment = WINDOW, seed: int = 0) -> OracleMaps:
-    (maps,) = pieces_of(oracle(truth, settings, seed), [segment])
+def one_submodel(truth: TrueScene, settings: OracleSettings, segment: Segment = WINDOW, seed: int = 0) -> OracleMaps:
+    (maps,) = submodels_of(oracle(truth, settings, seed), [segment])
     return maps
 
 
-def pieces_of(backbone: OracleBackbone, segments: Sequence[Segment]) -> tuple[OracleMaps, ...]:
+def submodels_of(backbone: OracleBackbone, segments: Sequence[Segment]) -> tuple[OracleMaps, ...]:
     return oracle_maps(backbone.reconstruct(segments, with_maps=range(len(segments))))
 
 
-def aligned(target: OracleMaps, source: OracleMaps) -> PieceFit:
-    return align_pointmaps(target.piece, source.piece, target, source, AlignmentConfig())
+def aligned(target: OracleMaps, source: OracleMaps) -> SubmodelFit:
+    return align_pointmaps(target.submodel, source.submodel, target, source, AlignmentConfig())
 
 
 def relative_depth(maps: OracleMaps, truth: TrueScene, k: int) -> FloatArray:
     """(H, W) simulated over true depth."""
-    ratio: FloatArray = maps.depth(k).astype(np.float64) / truth.depth(maps.piece.images[k])
+    ratio: FloatArray = maps.depth(k).astype(np.float64) / truth.depth(maps.submodel.images[k])
     return ratio
 
 
@@ -80,11 +80,11 @@ def rms(values: Sequence[float] | FloatArray) -> float:
 # --------------------------------------------------------------------------------- truth
 def test_perfect_neighbours_align_to_their_true_relation(truth: TrueScene) -> None:
     windows = plan_windows(NUM_IMAGES, segment_length=60, overlap=30)
-    pieces = pieces_of(oracle(truth, PERFECT), windows)
-    assert len(pieces) == 3
+    submodels = submodels_of(oracle(truth, PERFECT), windows)
+    assert len(submodels) == 3
     for target, source in ((0, 1), (1, 2)):
-        found = aligned(pieces[target], pieces[source])
-        expected = true_relation(pieces[target], pieces[source])
+        found = aligned(submodels[target], submodels[source])
+        expected = true_relation(submodels[target], submodels[source])
         np.testing.assert_allclose(found.estimate.b_from_a.matrix, expected.target_from_source, atol=1e-5)
         first_to_first = invert_rigid(truth.world_from_cam[windows[target].images[0]])
         np.testing.assert_allclose(
@@ -99,8 +99,8 @@ def test_perfect_neighbours_align_to_their_true_relation(truth: TrueScene) -> No
 
 
 def test_perfect_maps_are_the_truth_in_the_frame_of_the_first_camera(truth: TrueScene) -> None:
-    maps = one_piece(truth, PERFECT)
-    np.testing.assert_allclose(maps.piece.seg_from_cam[0], np.eye(4)[:3], atol=1e-12)
+    maps = one_submodel(truth, PERFECT)
+    np.testing.assert_allclose(maps.submodel.seg_from_cam[0], np.eye(4)[:3], atol=1e-12)
     for k in (0, 33, 60):
         np.testing.assert_array_equal(maps.depth(k), truth.depth(k))
         np.testing.assert_array_equal(maps.rgb(k), truth.rgb(k))
@@ -112,8 +112,8 @@ def test_perfect_maps_are_the_truth_in_the_frame_of_the_first_camera(truth: True
 
 
 def test_random_gauge_changes_the_frame_and_nothing_else(truth: TrueScene) -> None:
-    usual, anywhere = (one_piece(truth, replace(PERFECT, gauge=gauge)) for gauge in ("first-camera", "random"))
-    assert np.abs(anywhere.piece.seg_from_cam[0] - np.eye(4)[:3]).max() > 0.1
+    usual, anywhere = (one_submodel(truth, replace(PERFECT, gauge=gauge)) for gauge in ("first-camera", "random"))
+    assert np.abs(anywhere.submodel.seg_from_cam[0] - np.eye(4)[:3]).max() > 0.1
     relation = Sim3.from_matrix(true_relation(anywhere, usual).target_from_source)
     assert float(relation.scale) == pytest.approx(1)
     np.testing.assert_allclose(
@@ -123,16 +123,16 @@ def test_random_gauge_changes_the_frame_and_nothing_else(truth: TrueScene) -> No
 
 def test_maps_obey_their_protocol_in_every_preset(truth: TrueScene) -> None:
     for settings in PRESETS.values():
-        maps = one_piece(truth, settings)
-        assert len(maps) == len(maps.piece.images) == 61
+        maps = one_submodel(truth, settings)
+        assert len(maps) == len(maps.submodel.images) == 61
         for k in (0, 60):
-            intrinsics = maps.piece.intrinsics[k].resized(WIDTH, HEIGHT)
-            expected = pointmap_from_depth(maps.depth(k), intrinsics, maps.piece.seg_from_cam[k])
+            intrinsics = maps.submodel.intrinsics[k].resized(WIDTH, HEIGHT)
+            expected = pointmap_from_depth(maps.depth(k), intrinsics, maps.submodel.seg_from_cam[k])
             np.testing.assert_array_equal(maps.pointmap_seg(k), expected)
             assert maps.depth(k).dtype == maps.confidence(k).dtype == maps.pointmap_seg(k).dtype == np.float32
             assert maps.rgb(k).dtype == np.uint8
             assert maps.confidence(k).min() >= 1
-        rotations = maps.piece.seg_from_cam[:, :, :3]
+        rotations = maps.submodel.seg_from_cam[:, :, :3]
         np.testing.assert_allclose(rotations @ rotations.swapaxes(1, 2), np.tile(np.eye(3), (61, 1, 1)), atol=1e-12)
 
 
@@ -141,8 +141,8 @@ def test_intrinsics_have_the_size_of_the_collection(truth: TrueScene) -> None:
     images = tuple(replace(image, width=640, height=480) for image in small.images)
     large = ImageCollection(images=images, cameras=(truth.intrinsics.resized(640, 480),))
     result = OracleBackbone(truth, large, PERFECT).reconstruct([WINDOW], with_maps=[0])
-    assert result.pieces[0].intrinsics[0].params == pytest.approx(demo_intrinsics(640, 480).params)
-    np.testing.assert_array_equal(result.dense[0].pointmap_seg(3), one_piece(truth, PERFECT).pointmap_seg(3))
+    assert result.submodels[0].intrinsics[0].params == pytest.approx(demo_intrinsics(640, 480).params)
+    np.testing.assert_array_equal(result.dense[0].pointmap_seg(3), one_submodel(truth, PERFECT).pointmap_seg(3))
 
 
 def test_an_oracle_is_a_backbone(truth: TrueScene) -> None:
@@ -159,7 +159,7 @@ def errors_over_seeds(
     truth: TrueScene, settings: OracleSettings, measure: Callable[[OracleMaps], float], num_seeds: int = 40
 ) -> float:
     """Root mean square of what is measured in the same segment of many runs."""
-    return rms([measure(one_piece(truth, settings, seed=seed)) for seed in range(num_seeds)])
+    return rms([measure(one_submodel(truth, settings, seed=seed)) for seed in range(num_seeds)])
 
 
 def local_change(maps: OracleMaps) -> FloatArray:
@@ -185,10 +185,10 @@ def test_drift_after_sixty_images_has_the_stated_size(truth: TrueScene) -> None:
 
 
 def test_drift_of_the_scale_is_in_depths_and_in_steps(truth: TrueScene) -> None:
-    maps = one_piece(truth, replace(PERFECT, drift_scale=0.3))
+    maps = one_submodel(truth, replace(PERFECT, drift_scale=0.3))
     scales = np.array([np.median(relative_depth(maps, truth, k)) for k in range(61)])
     assert np.ptp(scales) > 0.05
-    steps = np.linalg.norm(np.diff(maps.piece.seg_from_cam[:, :, 3], axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(maps.submodel.seg_from_cam[:, :, 3], axis=0), axis=1)
     true_steps = np.linalg.norm(np.diff(truth.world_from_cam[:61, :, 3], axis=0), axis=1)
     np.testing.assert_allclose(steps / true_steps, scales[:-1], rtol=1e-5)
 
@@ -196,7 +196,7 @@ def test_drift_of_the_scale_is_in_depths_and_in_steps(truth: TrueScene) -> None:
 def test_drift_of_the_chain_has_the_stated_size_and_no_overlap_shows_it(truth: TrueScene) -> None:
     settings = replace(PERFECT, chain_rotation_deg=3.0, chain_scale=0.05)
     windows = plan_windows(NUM_IMAGES, segment_length=61, overlap=30)
-    first, second, _ = pieces_of(oracle(truth, settings), windows)
+    first, second, _ = submodels_of(oracle(truth, settings), windows)
     for maps in (first, second):
         scale = np.cbrt(np.linalg.det(local_change(maps)[:3, :3]))
         assert abs(np.log(scale)) == pytest.approx(0.05)
@@ -208,7 +208,7 @@ def test_drift_of_the_chain_has_the_stated_size_and_no_overlap_shows_it(truth: T
 
 def test_own_drift_makes_neighbours_disagree_on_the_overlap(truth: TrueScene) -> None:
     windows = plan_windows(NUM_IMAGES, segment_length=60, overlap=30)
-    network = [pieces_of(oracle(truth, OracleSettings(), seed), windows) for seed in range(10)]
+    network = [submodels_of(oracle(truth, OracleSettings(), seed), windows) for seed in range(10)]
     relations = [true_relation(first, second) for first, second, _ in network]
     assert 0.1 < np.mean([one.spread_rotation_deg for one in relations]) < 0.5
     assert 0.001 < np.mean([one.spread_log_scale for one in relations]) < 0.007
@@ -216,15 +216,15 @@ def test_own_drift_makes_neighbours_disagree_on_the_overlap(truth: TrueScene) ->
 
 def test_scale_and_focal_length_scatter_between_segments_as_stated(truth: TrueScene) -> None:
     pair = Segment(index=0, images=(3, 4))
-    jittered = [one_piece(truth, replace(PERFECT, scale_jitter=0.1), pair, seed) for seed in range(100)]
+    jittered = [one_submodel(truth, replace(PERFECT, scale_jitter=0.1), pair, seed) for seed in range(100)]
     logs = [np.log(np.median(relative_depth(maps, truth, 0))) for maps in jittered[:50]]
     assert 0.08 < rms(logs) < 0.12
-    steps = np.array([np.linalg.norm(maps.piece.seg_from_cam[1, :, 3]) for maps in jittered])
+    steps = np.array([np.linalg.norm(maps.submodel.seg_from_cam[1, :, 3]) for maps in jittered])
     true_step = np.linalg.norm(truth.world_from_cam[4, :, 3] - truth.world_from_cam[3, :, 3])
     assert 0.08 < rms(np.log(steps / true_step)) < 0.12
 
-    zoomed = [one_piece(truth, replace(PERFECT, focal_error=0.03), pair, seed) for seed in range(100)]
-    factors = np.array([maps.piece.intrinsics[0].focal_px / truth.intrinsics.focal_px for maps in zoomed])
+    zoomed = [one_submodel(truth, replace(PERFECT, focal_error=0.03), pair, seed) for seed in range(100)]
+    factors = np.array([maps.submodel.intrinsics[0].focal_px / truth.intrinsics.focal_px for maps in zoomed])
     assert 0.025 < rms(np.log(factors)) < 0.035
     assert relative_depth(zoomed[0], truth, 1) == pytest.approx(factors[0], rel=1e-5)
 
@@ -233,7 +233,7 @@ def test_smooth_depth_error_grows_to_the_stated_size(truth: TrueScene) -> None:
     settings = replace(PERFECT, depth_distortion=0.04)
     logs = [
         [np.log(relative_depth(maps, truth, k)) for k in (0, 60)]
-        for maps in (one_piece(truth, settings, seed=seed) for seed in range(40))
+        for maps in (one_submodel(truth, settings, seed=seed) for seed in range(40))
     ]
     at_first, at_last = (rms([rms(pair[which]) for pair in logs]) for which in (0, 1))
     assert 0.04 / np.sqrt(2) * 0.85 < at_first < 0.04 / np.sqrt(2) * 1.15
@@ -245,12 +245,12 @@ def test_smooth_depth_error_grows_to_the_stated_size(truth: TrueScene) -> None:
 
 
 def test_noise_and_patches_have_the_stated_size(truth: TrueScene) -> None:
-    noisy = one_piece(truth, replace(PERFECT, depth_noise=0.02))
+    noisy = one_submodel(truth, replace(PERFECT, depth_noise=0.02))
     logs = np.array([np.log(relative_depth(noisy, truth, k)) for k in range(10)])
     assert 0.019 < logs.std() < 0.021
     assert abs(np.mean(logs[:, :, 1:] * logs[:, :, :-1])) < 0.05 * 0.02**2
 
-    patched = one_piece(truth, replace(PERFECT, blob_share=0.2))
+    patched = one_submodel(truth, replace(PERFECT, blob_share=0.2))
     ratios = np.array([relative_depth(patched, truth, k) for k in range(61)])
     deep = ratios > 1 + 1e-4
     assert 0.18 < deep.mean() < 0.22
@@ -263,7 +263,7 @@ def test_noise_and_patches_have_the_stated_size(truth: TrueScene) -> None:
 
 def test_confidence_knows_of_its_share_of_the_patches(truth: TrueScene) -> None:
     for share in (0.0, 0.5, 1.0):
-        maps = one_piece(truth, replace(PERFECT, blob_share=0.2, confidence_knows=share))
+        maps = one_submodel(truth, replace(PERFECT, blob_share=0.2, confidence_knows=share))
         deep = np.array([relative_depth(maps, truth, k) > 1.1 for k in range(40)])
         confidence = np.array([maps.confidence(k) for k in range(40)])
         np.testing.assert_allclose(confidence[~deep], 10, atol=1e-5)
@@ -273,7 +273,9 @@ def test_confidence_knows_of_its_share_of_the_patches(truth: TrueScene) -> None:
 
 def test_confidence_falls_with_smooth_error_only_as_far_as_it_knows(truth: TrueScene) -> None:
     def correlation(knows: float) -> float:
-        maps = one_piece(truth, replace(PERFECT, depth_distortion=0.05, confidence_knows=knows, confidence_noise=0.2))
+        maps = one_submodel(
+            truth, replace(PERFECT, depth_distortion=0.05, confidence_knows=knows, confidence_noise=0.2)
+        )
         error = np.abs([np.log(relative_depth(maps, truth, k)) for k in range(0, 61, 10)]).ravel()
         return float(np.corrcoef(error, np.array([maps.confidence(k) for k in range(0, 61, 10)]).ravel())[0, 1])
 
@@ -285,7 +287,7 @@ def test_confidence_falls_with_smooth_error_only_as_far_as_it_knows(truth: TrueS
 def test_warp_is_of_its_group_and_size_and_cameras_stay_rigid(truth: TrueScene, group: str) -> None:
     assert group in {"affine3", "sl4"}
     settings = replace(PERFECT, warp=0.05, warp_group="affine3" if group == "affine3" else "sl4")
-    maps, exact = one_piece(truth, settings), one_piece(truth, PERFECT)
+    maps, exact = one_submodel(truth, settings), one_submodel(truth, PERFECT)
     warp = maps.geometry.warp / maps.geometry.warp[3, 3]
     assert (np.abs(warp[3, :3]).max() > 1e-4) == (group == "sl4")
     if group == "affine3":
@@ -298,15 +300,15 @@ def test_warp_is_of_its_group_and_size_and_cameras_stay_rigid(truth: TrueScene, 
     relation = true_relation(maps, exact)
     np.testing.assert_allclose(relation.target_from_source, warp, atol=1e-9)
 
-    rotations = maps.piece.seg_from_cam[:, :, :3]
+    rotations = maps.submodel.seg_from_cam[:, :, :3]
     np.testing.assert_allclose(rotations @ rotations.swapaxes(1, 2), np.tile(np.eye(3), (61, 1, 1)), atol=1e-12)
     assert (np.linalg.det(rotations) > 0).all()
-    camera = maps.piece.intrinsics[20]
-    unturned = maps.piece.seg_from_cam.copy()
-    unturned[:, :, :3] = exact.piece.seg_from_cam[:, :, :3]
+    camera = maps.submodel.intrinsics[20]
+    unturned = maps.submodel.seg_from_cam.copy()
+    unturned[:, :, :3] = exact.submodel.seg_from_cam[:, :, :3]
     off_px = [
         np.median(np.abs(camera.xy_img(pointmap_in(pose, maps.pointmap_seg(20))) - pixel_centres(WIDTH, HEIGHT)))
-        for pose in (maps.piece.seg_from_cam[20], unturned[20])
+        for pose in (maps.submodel.seg_from_cam[20], unturned[20])
     ]
     assert 0.01 < off_px[0] < 0.75 * off_px[1], "a rigid camera turns to see the warped points nearly in their pixels"
 
@@ -321,11 +323,11 @@ def pointmap_in(frame_from_cam: FloatArray, pointmap: npt.NDArray[np.float32]) -
 # ---------------------------------------------------------------------- same again, and lazy
 def test_a_segment_comes_out_the_same_whatever_else_is_asked(truth: TrueScene) -> None:
     settings = replace(OracleSettings(), warp=0.02)
-    alone = one_piece(truth, settings)
+    alone = one_submodel(truth, settings)
     others = [Segment(index=0, images=(100, 101, 102)), Segment(index=1, images=tuple(reversed(WINDOW.images)))]
-    _, again = pieces_of(oracle(truth, settings), others)
-    np.testing.assert_array_equal(again.piece.seg_from_cam, alone.piece.seg_from_cam)
-    assert again.piece.intrinsics == alone.piece.intrinsics
+    _, again = submodels_of(oracle(truth, settings), others)
+    np.testing.assert_array_equal(again.submodel.seg_from_cam, alone.submodel.seg_from_cam)
+    assert again.submodel.intrinsics == alone.submodel.intrinsics
     later = again.depth(40)
     np.testing.assert_array_equal(again.depth(7), alone.depth(7))
     np.testing.assert_array_equal(alone.depth(40), later)
@@ -340,7 +342,7 @@ def test_seeds_segments_and_settings_differ(truth: TrueScene) -> None:
     other_seed = oracle(truth, settings, seed=1).reconstruct([WINDOW], with_maps=[])
     assert np.abs(base.dense[0].depth(0) - other_seed.dense[0].depth(0)).max() > 1e-3
     shorter = replace(WINDOW, images=WINDOW.images[:-1])
-    assert np.abs(base.dense[0].depth(0) - one_piece(truth, settings, shorter).depth(0)).max() > 1e-3
+    assert np.abs(base.dense[0].depth(0) - one_submodel(truth, settings, shorter).depth(0)).max() > 1e-3
     hard = oracle(truth, PRESETS["hard"]).reconstruct([WINDOW], with_maps=[])
     assert len({base.dense_key, other_seed.dense_key, hard.dense_key}) == 3
     assert base.dense_key == oracle(truth, settings).reconstruct([WINDOW], with_maps=[0]).dense_key
@@ -348,8 +350,8 @@ def test_seeds_segments_and_settings_differ(truth: TrueScene) -> None:
 
 
 def test_one_error_leaves_the_draws_of_the_others_alone(truth: TrueScene) -> None:
-    noisy = one_piece(truth, replace(PERFECT, depth_noise=0.01))
-    bent = one_piece(truth, replace(PERFECT, depth_noise=0.01, drift_scale=0.02, blob_share=0.0, scale_jitter=0.1))
+    noisy = one_submodel(truth, replace(PERFECT, depth_noise=0.01))
+    bent = one_submodel(truth, replace(PERFECT, depth_noise=0.01, drift_scale=0.02, blob_share=0.0, scale_jitter=0.1))
     ratio = bent.depth(30) / noisy.depth(30)
     np.testing.assert_allclose(ratio, np.median(ratio), rtol=1e-5)
     assert np.median(ratio) != pytest.approx(1, abs=1e-3)
@@ -388,7 +390,7 @@ def test_maps_are_made_when_they_are_read(truth: TrueScene) -> None:
 
 
 def test_reading_a_map_gives_a_copy(truth: TrueScene) -> None:
-    maps = one_piece(truth, PERFECT)
+    maps = one_submodel(truth, PERFECT)
     maps.depth(0)[:] = 0
     maps.rgb(0)[:] = 0
     assert maps.depth(0).min() > 0
@@ -473,34 +475,34 @@ def false_segment(backbone: OracleBackbone, reach: int = 5) -> Segment:
 def test_a_false_loop_is_laid_onto_itself_and_looks_sound(truth: TrueScene) -> None:
     backbone = oracle(truth, WITH_FALSE_LOOPS)
     segment, loop = false_segment(backbone), backbone.false_loops[0]
-    mislaid = one_piece(truth, WITH_FALSE_LOOPS, segment)
+    mislaid = one_submodel(truth, WITH_FALSE_LOOPS, segment)
     assert mislaid.geometry.mislaid
     a, b = (segment.images.index(image) for image in (loop.first[3], loop.second[3]))
-    np.testing.assert_allclose(mislaid.piece.seg_from_cam[a], mislaid.piece.seg_from_cam[b], atol=1e-9)
+    np.testing.assert_allclose(mislaid.submodel.seg_from_cam[a], mislaid.submodel.seg_from_cam[b], atol=1e-9)
     assert mislaid.confidence(b).min() > 9
     for images in (range(loop.first[0] - 5, loop.first[-1] + 6), range(loop.second[0] - 5, loop.second[-1] + 6)):
-        window = one_piece(truth, PERFECT, Segment(index=0, images=tuple(i for i in images if 0 <= i < NUM_IMAGES)))
+        window = one_submodel(truth, PERFECT, Segment(index=0, images=tuple(i for i in images if 0 <= i < NUM_IMAGES)))
         found = aligned(mislaid, window)
         expected = true_relation(mislaid, window)
         np.testing.assert_allclose(found.estimate.b_from_a.matrix, expected.target_from_source, atol=1e-5)
         assert found.relative_residual < 1e-5, "each half by itself is right"
-    as_window = one_piece(truth, WITH_FALSE_LOOPS, replace(segment, kind="window"))
+    as_window = one_submodel(truth, WITH_FALSE_LOOPS, replace(segment, kind="window"))
     assert not as_window.geometry.mislaid
 
 
 def test_a_true_loop_comes_out_right_even_where_false_ones_exist(truth: TrueScene) -> None:
-    maps = one_piece(truth, WITH_FALSE_LOOPS, TRUE_LOOP)
+    maps = one_submodel(truth, WITH_FALSE_LOOPS, TRUE_LOOP)
     assert not maps.geometry.mislaid
     expected = invert_rigid(truth.world_from_cam[0]) @ np.vstack([truth.world_from_cam[119], [0, 0, 0, 1]])
-    np.testing.assert_allclose(maps.piece.seg_from_cam[-1], expected, atol=1e-9)
-    noisy = one_piece(truth, replace(OracleSettings(), scale_jitter=0.0), TRUE_LOOP)
-    assert 1e-3 < np.linalg.norm(noisy.piece.seg_from_cam[-1, :, 3] - expected[:, 3]) < 0.1
+    np.testing.assert_allclose(maps.submodel.seg_from_cam[-1], expected, atol=1e-9)
+    noisy = one_submodel(truth, replace(OracleSettings(), scale_jitter=0.0), TRUE_LOOP)
+    assert 1e-3 < np.linalg.norm(noisy.submodel.seg_from_cam[-1, :, 3] - expected[:, 3]) < 0.1
 
 
 def test_halves_that_say_nothing_are_laid_onto_each_other_too(truth: TrueScene) -> None:
-    maps = one_piece(truth, PERFECT, Segment(index=0, images=(*range(5), *range(60, 65)), kind="loop"))
+    maps = one_submodel(truth, PERFECT, Segment(index=0, images=(*range(5), *range(60, 65)), kind="loop"))
     assert maps.geometry.mislaid
-    np.testing.assert_allclose(maps.piece.seg_from_cam[2], maps.piece.seg_from_cam[7], atol=1e-9)
+    np.testing.assert_allclose(maps.submodel.seg_from_cam[2], maps.submodel.seg_from_cam[7], atol=1e-9)
 
 
 def test_the_stronger_evidence_decides_what_is_taken_for_what() -> None:
@@ -521,9 +523,9 @@ def test_the_stronger_evidence_decides_what_is_taken_for_what() -> None:
 def test_segments_fail_and_images_drop_in_the_stated_share(truth: TrueScene) -> None:
     segments = [Segment(index=k, images=tuple(range(k, k + 20))) for k in range(100)]
     failing = oracle(truth, replace(PERFECT, failed_share=0.3)).reconstruct(segments, with_maps=[])
-    failed = [one for one in failing.reconstructions if not one.pieces]
+    failed = [one for one in failing.reconstructions if not one.submodels]
     assert 20 < len(failed) < 40
-    assert len(failing.dense) == len(failing.pieces) == 100 - len(failed)
+    assert len(failing.dense) == len(failing.submodels) == 100 - len(failed)
     assert len(failed[0].unregistered) == 20
     assert "told to fail" in failed[0].unregistered[0].reason
 
@@ -531,7 +533,7 @@ def test_segments_fail_and_images_drop_in_the_stated_share(truth: TrueScene) -> 
     dropped = sum(len(one.unregistered) for one in dropping.reconstructions)
     assert 150 < dropped < 250
     for one, segment in zip(dropping.reconstructions, segments, strict=True):
-        assert {*one.pieces[0].images, *(left.image for left in one.unregistered)} == set(segment.images)
+        assert {*one.submodels[0].images, *(left.image for left in one.unregistered)} == set(segment.images)
 
 
 # -------------------------------------------------------------------------------- RGB-D folder
@@ -583,7 +585,7 @@ def test_a_folder_without_names_gives_all_its_images(rgbd_folder: Path) -> None:
 
 def test_pixels_without_depth_stay_without(rgbd_folder: Path) -> None:
     read = TrueScene.from_rgbd_folder(rgbd_folder, NAMES, max_size=48)
-    maps = one_piece(read, OracleSettings(), Segment(index=0, images=(4, 5)))
+    maps = one_submodel(read, OracleSettings(), Segment(index=0, images=(4, 5)))
     assert np.isnan(maps.pointmap_seg(0)[0, 0]).all()
     assert maps.depth(0)[0, 0] == 0
     assert maps.confidence(0)[0, 0] == 1
@@ -605,7 +607,7 @@ def test_kitchen_becomes_segments_with_depth_in_every_frame(data_dir: Callable[[
     assert 1.0 < kitchen.typical_depth < 3.0
     assert min(np.mean(kitchen.depth(k) > 0) for k in range(24)) > 0.7
     windows = plan_windows(24, segment_length=16, overlap=8)
-    target, source = pieces_of(oracle(kitchen, PERFECT), windows)
+    target, source = submodels_of(oracle(kitchen, PERFECT), windows)
     found = aligned(target, source)
     np.testing.assert_allclose(
         found.estimate.b_from_a.matrix, true_relation(target, source).target_from_source, atol=1e-5
@@ -641,15 +643,15 @@ def test_another_collection_is_refused(truth: TrueScene) -> None:
         OracleBackbone(truth, ImageCollection(images=swapped, cameras=collection.cameras), PERFECT)
 
 
-def test_pieces_without_shared_images_have_no_true_relation(truth: TrueScene) -> None:
-    far = one_piece(truth, PERFECT, Segment(index=1, images=(100, 101)))
-    with pytest.raises(DegenerateAlignmentError, match=r"pieces 0 and 1 share no image"):
-        true_relation(one_piece(truth, PERFECT), far)
+def test_submodels_without_shared_images_have_no_true_relation(truth: TrueScene) -> None:
+    far = one_submodel(truth, PERFECT, Segment(index=1, images=(100, 101)))
+    with pytest.raises(DegenerateAlignmentError, match=r"submodels 0 and 1 share no image"):
+        true_relation(one_submodel(truth, PERFECT), far)
 
 
 def test_a_map_of_no_image_is_refused(truth: TrueScene) -> None:
     with pytest.raises(IndexError, match=r"image 61 of 61"):
-        one_piece(truth, PERFECT).depth(61)
+        one_submodel(truth, PERFECT).depth(61)
 
 
 def test_a_scene_whose_parts_do_not_fit_is_refused(truth: TrueScene) -> None:
@@ -666,7 +668,7 @@ class BlindViews(CountedViews):
 
 def test_a_scene_without_depth_is_refused(truth: TrueScene) -> None:
     with pytest.raises(CollectionError, match=r"16 of 120 images were looked at and none has depth"):
-        one_piece(replace(truth, views=BlindViews(truth)), PERFECT)
+        one_submodel(replace(truth, views=BlindViews(truth)), PERFECT)
 
 
 def test_folders_that_are_not_rgbd_sequences_are_refused(rgbd_folder: Path, tmp_path: Path) -> None:

@@ -41,8 +41,8 @@ from smust3r_colmap.products import (
     RunFeatures,
     Segment,
     SegmentKind,
-    SegmentPiece,
     SegmentReconstruction,
+    Submodel,
     UnregisteredImage,
 )
 from smust3r_colmap.storage.dense_maps import EmptyMaps, StoredMaps
@@ -96,7 +96,7 @@ class ClassicalBackbone:
         with TaskPool(workers=self.workers, log_file=self.run.native_log) as pool:
             mapped = self._map(segments, pairs, pool)
             reconstructions = [_reconstruction(one) for one in mapped]
-            dense, dense_key = self._dense([p for r in reconstructions for p in r.pieces], with_maps, pool)
+            dense, dense_key = self._dense([p for r in reconstructions for p in r.submodels], with_maps, pool)
         return BackboneResult(
             reconstructions=tuple(reconstructions),
             dense=dense,
@@ -295,11 +295,11 @@ class ClassicalBackbone:
         return [failed[k] if k in failed else read_mapped(folder.path) for k, folder in enumerate(folders)]
 
     def _dense(
-        self, pieces: Sequence[SegmentPiece], with_maps: Collection[int], pool: TaskPool
+        self, submodels: Sequence[Submodel], with_maps: Collection[int], pool: TaskPool
     ) -> tuple[tuple[DenseMaps, ...], str]:
-        """Maps of every piece and their common key; a piece whose sweep failed gets empty ones and a warning."""
-        tasks = [self._depth_task(piece) for piece in pieces]
-        wanted = [task for task in tasks if task.piece.segment in with_maps]
+        """Maps of every submodel and their common key; a submodel whose sweep failed gets empty ones and a warning."""
+        tasks = [self._depth_task(submodel) for submodel in submodels]
+        wanted = [task for task in tasks if task.submodel.segment in with_maps]
         missing = [task for task in wanted if not task.folder.is_done]
         total = sum(len(task.images) for task in wanted)
         with self.reporter.stage("depth", total=total) as stage:
@@ -307,23 +307,25 @@ class ClassicalBackbone:
             for result in pool.map(make_depth, missing):
                 task = missing[result.index]
                 if isinstance(result.value, TaskFailure):
-                    self.reporter.warn(f"segment {task.piece.name} has no depth maps: {result.value.reason}")
+                    self.reporter.warn(f"segment {task.submodel.name} has no depth maps: {result.value.reason}")
                 stage.advance(len(task.images))
-        done = [task.piece.segment in with_maps and task.folder.is_done for task in tasks]
+        done = [task.submodel.segment in with_maps and task.folder.is_done for task in tasks]
         maps: tuple[DenseMaps, ...] = tuple(
-            StoredMaps(task.folder.path, task.piece) if there else EmptyMaps(task.piece, longer_side=task.dense_size)
+            StoredMaps(task.folder.path, task.submodel)
+            if there
+            else EmptyMaps(task.submodel, longer_side=task.dense_size)
             for task, there in zip(tasks, done, strict=True)
         )
         return maps, key_of([(task.folder.key, there) for task, there in zip(tasks, done, strict=True)])
 
-    def _depth_task(self, piece: SegmentPiece) -> DepthTask:
-        images = tuple(self.collection.images[i] for i in piece.images)
-        geometry = (piece.seg_from_cam, piece.intrinsics, piece.tracks)
+    def _depth_task(self, submodel: Submodel) -> DepthTask:
+        images = tuple(self.collection.images[i] for i in submodel.images)
+        geometry = (submodel.seg_from_cam, submodel.intrinsics, submodel.tracks)
         key = key_of("depth", [i.digest for i in images], geometry, self.config.dense_size, self.config.depth_planes)
         return DepthTask(
-            piece=piece,
+            submodel=submodel,
             images=images,
-            folder=self._segment_stage(piece.segment, f"depth_{piece.piece}", key),
+            folder=self._segment_stage(submodel.segment, f"depth_{submodel.submodel}", key),
             dense_size=self.config.dense_size,
             planes=self.config.depth_planes,
         )
@@ -347,10 +349,10 @@ def _with_failure(mapped: MappedSegment, stage: str, failure: TaskFailure) -> Ma
 
 
 def _reconstruction(mapped: MappedSegment) -> SegmentReconstruction:
-    pieces = tuple(
-        SegmentPiece(
+    submodels = tuple(
+        Submodel(
             segment=mapped.segment,
-            piece=number,
+            submodel=number,
             images=model.images,
             seg_from_cam=model.seg_from_cam,
             intrinsics=model.intrinsics,
@@ -362,7 +364,7 @@ def _reconstruction(mapped: MappedSegment) -> SegmentReconstruction:
     )
     return SegmentReconstruction(
         segment=mapped.segment,
-        pieces=pieces,
+        submodels=submodels,
         unregistered=mapped.unregistered,
         attempts=mapped.attempts,
         metric=ClassicalBackbone.metric,

@@ -1,4 +1,4 @@
-"""Depth maps of one piece, made in a child process and written as a finished stage."""
+"""Depth maps of one submodel, made in a child process and written as a finished stage."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from dataclasses import dataclass
 
 from smust3r_colmap.backbones.classical.plane_sweep import ColourImage, reconstruct_depth
 from smust3r_colmap.importers.images import load_rgb
-from smust3r_colmap.products import SegmentPiece, SourceImage
+from smust3r_colmap.products import SourceImage, Submodel
 from smust3r_colmap.storage.dense_maps import ImageMaps, write_maps
 from smust3r_colmap.storage.run_directory import StageFolder
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DepthTask:
-    """A piece with the images it was made of, in the piece's order, and where its maps go."""
+    """A submodel with the images it was made of, in the submodel's order, and where its maps go."""
 
-    piece: SegmentPiece
+    submodel: Submodel
     images: tuple[SourceImage, ...]
     folder: StageFolder
     dense_size: int
@@ -23,25 +23,25 @@ class DepthTask:
 
 
 def make_depth(task: DepthTask) -> None:
-    """Sweep all images of the piece and finish the stage.
+    """Sweep all images of the submodel and finish the stage.
 
     Raises:
         ImageError: an image can no longer be read. StorageError: the disk refused.
-        ValueError: the piece has no tracks.
+        ValueError: the submodel has no tracks.
     """
-    piece = task.piece
-    if piece.tracks is None:
-        raise ValueError(f"piece {piece.name} has no tracks to bound its depth")
+    submodel = task.submodel
+    if submodel.tracks is None:
+        raise ValueError(f"submodel {submodel.name} has no tracks to bound its depth")
 
     def load(k: int) -> ColourImage:
         return load_rgb(task.images[k])
 
     depths = reconstruct_depth(
         load,
-        images=piece.images,
-        seg_from_cam=piece.seg_from_cam,
-        intrinsics=piece.intrinsics,
-        tracks=piece.tracks,
+        images=submodel.images,
+        seg_from_cam=submodel.seg_from_cam,
+        intrinsics=submodel.intrinsics,
+        tracks=submodel.tracks,
         dense_size=task.dense_size,
         planes=task.planes,
     )

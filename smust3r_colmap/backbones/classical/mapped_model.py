@@ -1,4 +1,4 @@
-"""One connected model of a segment as arrays, before it becomes a piece of the run.
+"""One connected model of a segment as arrays, before it becomes a submodel of the run.
 
 The next module to read is ``model_checks``.
 """
@@ -21,7 +21,7 @@ MIN_SHARED_IMAGES = 4
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MappedModel:
-    """One connected model of a segment, as arrays (see ``SegmentPiece`` for shapes)."""
+    """One connected model of a segment, as arrays (see ``Submodel`` for shapes)."""
 
     images: tuple[int, ...]
     seg_from_cam: npt.NDArray[np.float64]

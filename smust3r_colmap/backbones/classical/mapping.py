@@ -3,7 +3,7 @@
 No mapper is safe alone: the incremental one finds no start on straight forward motion and stops at
 weak spots, the global one registers more but may be wrong with a perfect-looking error. So a ladder
 is climbed until the models pass the checks: incremental from a chosen pair, relaxed incremental, global.
-What still does not hold together becomes several pieces. Everything here runs in a child process.
+What still does not hold together becomes several submodels. Everything here runs in a child process.
 The next module to read is ``calibration``.
 """
 
@@ -45,7 +45,7 @@ logger = logging.getLogger(__name__)
 
 ENOUGH_REGISTERED = 0.9
 """Share of a segment's images in sound models at which the ladder stops."""
-MIN_PIECE_IMAGES = 4
+MIN_SUBMODEL_IMAGES = 4
 """Smaller models are too weak to be a node; only of a smaller segment they are all one can have."""
 MIN_PAIR_INLIERS = 15
 """Verified matches below which COLMAP does not use a pair."""
@@ -141,7 +141,7 @@ class _Ladder:
         self.candidates: list[tuple[MappedModel, ...]] = []
         self.largest_output: Path | None = None
         self.mapped: dict[str, dict[int, pycolmap.Reconstruction]] = {}
-        self.min_images = MIN_PIECE_IMAGES if len(task.images) >= MIN_PIECE_IMAGES else 2
+        self.min_images = MIN_SUBMODEL_IMAGES if len(task.images) >= MIN_SUBMODEL_IMAGES else 2
         self.inliers = self._build_database("segment.db", task.pairs)
 
     def climb(self) -> None:
@@ -305,7 +305,7 @@ class _Ladder:
         options.mapper.num_threads = 1
         options.mapper.random_seed = self.task.seed
         options.triangulation.random_seed = self.task.seed
-        if len(self.task.images) < MIN_PIECE_IMAGES:
+        if len(self.task.images) < MIN_SUBMODEL_IMAGES:
             # There is hardly a third view that could confirm a point.
             options.triangulation.ignore_two_view_tracks = False
         return options

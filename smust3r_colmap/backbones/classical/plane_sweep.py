@@ -1,4 +1,4 @@
-"""Dense depth of a registered piece: a multi-view plane sweep, then agreement between views.
+"""Dense depth of a registered submodel: a multi-view plane sweep, then agreement between views.
 
 For every image, in this order:
 
@@ -77,7 +77,7 @@ _EDGE_GREY = 8.0  # grey step that halves P2: depth jumps where the image does
 _MIN_WEIGHT = 0.05  # NCC given to a neighbour that fits nowhere, so that it lowers the score
 _MAX_TANGENT = 2.5  # rays beyond 68 degrees from the axis are left out of pinhole views
 _MAX_VIEW_GROWTH = 1.5  # longer sides of a pinhole view and its image; wider views get a shorter focal
-_MIN_OWN_POINTS = 20  # an image with fewer sparse points borrows those of the piece
+_MIN_OWN_POINTS = 20  # an image with fewer sparse points borrows those of the submodel
 _TINY = 1e-6
 
 # cv2 indexes pixels by their centres from 0, cameras here from 0.5.
@@ -155,18 +155,18 @@ def reconstruct_depth(
     dense_size: int,
     planes: int,
 ) -> Iterator[ImageDepth]:
-    """Depth of all images of a piece, in their order.
+    """Depth of all images of a submodel, in their order.
 
     All of them are swept before the first is yielded, because the views confirm each other; about
     15 bytes per pixel and image are held meanwhile. An image without parallax, and every image of a
-    piece without sparse points, gets empty maps and a line in the log.
+    submodel without sparse points, gets empty maps and a line in the log.
 
     Args:
         load_rgb: position in ``images`` to the (height, width, 3) image, or (height, width) grey.
         images: (N,) indices into the collection.
         seg_from_cam: (N, 3, 4) rigid.
         intrinsics: one per image, at the original size.
-        tracks: sparse points of the piece.
+        tracks: sparse points of the submodel.
         dense_size: longer side of the maps; an image that is smaller keeps its size.
         planes: at most this many hypotheses per pixel.
 
@@ -191,7 +191,7 @@ def reconstruct_depth(
         around = np.concatenate([seen_by[j] for j in (k, *neighbours[k])])
         depth_range = inverse_depth_range(view.camera, around)
         if not neighbours[k] or depth_range is None:
-            logger.warning("image %d: no depth, no other image of the piece has parallax with it", images[k])
+            logger.warning("image %d: no depth, no other image of the submodel has parallax with it", images[k])
             depth = score = np.zeros_like(view.grey)
         else:
             compared = [views[j] for j in neighbours[k][:SWEEP_NEIGHBOURS]]

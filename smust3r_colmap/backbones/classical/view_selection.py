@@ -1,4 +1,4 @@
-"""Which images of a piece see the same surface from far enough apart, and how far away it is.
+"""Which images of a submodel see the same surface from far enough apart, and how far away it is.
 
 The plane sweep needs for every reference a few neighbours and a range of depths; both follow from
 the sparse points. Pinhole cameras only: images are undistorted before. The next module to read is
@@ -85,7 +85,7 @@ def choose_neighbours(
 
     Args:
         reference: position in ``cameras``.
-        cameras: all cameras of the piece.
+        cameras: all cameras of the submodel.
         points_seg: (P, 3) points that the reference sees.
         count: at most this many; fewer where parallax or overlap is missing, possibly none.
     """

@@ -362,7 +362,7 @@ class Must3rPredictor:
 
     def _prediction(self, segment: Segment, sights: Sequence[_Sight], notes: Sequence[str]) -> SegmentPrediction:
         """Cameras for all images that have one, and their maps."""
-        fitted, doubts = self._cameras(segment, [one.sighting for one in sights])
+        fitted, warnings = self._cameras(segment, [one.sighting for one in sights])
         images, lost = [], []
         for index, one, camera in zip(segment.images, sights, fitted, strict=True):
             if isinstance(camera, NoCamera):
@@ -375,7 +375,7 @@ class Must3rPredictor:
             unregistered=tuple(lost),
             method=f"MUSt3R at {self.settings.network_size} px, {num_keyframes} keyframes",
             notes=tuple(notes),
-            doubts=(*doubts, *_doubts([camera for camera in fitted if isinstance(camera, FittedCamera)])),
+            warnings=(*warnings, *_doubts([camera for camera in fitted if isinstance(camera, FittedCamera)])),
         )
 
     def _cameras(
@@ -415,20 +415,20 @@ def _encoded_at_once(device: torch.device) -> int:
 
 def _doubts(cameras: Sequence[FittedCamera]) -> tuple[str, ...]:
     """Why the geometry of a segment should not be trusted."""
-    doubts = []
+    warnings = []
     torn = [camera.relative_residual for camera in cameras if camera.relative_residual > MAX_RESIDUAL]
     if len(torn) > DOUBTED_SHARE * len(cameras):
-        doubts.append(
+        warnings.append(
             f"the two pointmaps of {len(torn)} of {len(cameras)} images contradict each other by more than "
             f"{MAX_RESIDUAL:.0%} of the depth ({np.median(torn):.0%} in the median)"
         )
     unsure = [camera.median_confidence for camera in cameras if camera.median_confidence < MIN_CONFIDENCE]
     if len(unsure) > DOUBTED_SHARE * len(cameras):
-        doubts.append(
+        warnings.append(
             f"the network is unsure of {len(unsure)} of {len(cameras)} images (median confidence "
             f"{np.median(unsure):.2f}, needed {MIN_CONFIDENCE})"
         )
-    return tuple(doubts)
+    return tuple(warnings)
 
 
 class _Progress:

@@ -30,7 +30,7 @@ _UNKNOWN_FREE = 4 * _GIB
 _FIXED = 64 * _MIB
 """Packing buffers of the linear algebra, thread pools, code that is loaded at first use."""
 _FRAGMENTATION = 1.3
-"""The allocator keeps freed pieces that the next request does not fit into."""
+"""The allocator keeps freed submodels that the next request does not fit into."""
 _OUTPUT_COPIES = 6
 """Of the head's output of an image: as linear layer, as map, activated, and what cameras are fitted to."""
 _LARGEST_BATCH_ON_CARD = 16

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from helpers.scenes import CAMERA, make_piece, points_ahead, rotation_about_y, walk
+from helpers.scenes import CAMERA, make_submodel, points_ahead, rotation_about_y, walk
 
 from smust3r_colmap.backbones.classical import backbone as backbone_module
 from smust3r_colmap.backbones.classical import calibration, mapping
@@ -75,15 +75,15 @@ def test_long_segments_match_neighbours_and_doubling_steps() -> None:
 
 # --------------------------------------------------------------------------- folds
 def model_of_walk(num_images: int) -> MappedModel:
-    piece = make_piece(
+    submodel = make_submodel(
         walk(num_images), tuple(range(num_images)), points_ahead(50, np.random.default_rng(0)), Sim3.identity()
     )
-    assert piece.tracks is not None
+    assert submodel.tracks is not None
     return MappedModel(
-        images=piece.images,
-        seg_from_cam=piece.seg_from_cam,
-        intrinsics=piece.intrinsics,
-        tracks=piece.tracks,
+        images=submodel.images,
+        seg_from_cam=submodel.seg_from_cam,
+        intrinsics=submodel.intrinsics,
+        tracks=submodel.tracks,
         reprojection_error_px=0.3,
         method="made up",
     )
@@ -605,11 +605,11 @@ def test_a_sweep_that_failed_leaves_readable_empty_maps_and_is_tried_again(
     synthetic: tuple[MappingTask, pycolmap.Reconstruction], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(TaskPool, "map", one_failure)
-    piece = make_piece(walk(3), (0, 1, 2), points_ahead(9, np.random.default_rng(0)), Sim3.identity())
+    submodel = make_submodel(walk(3), (0, 1, 2), points_ahead(9, np.random.default_rng(0)), Sim3.identity())
     with RunDirectory(tmp_path / "out") as run, TaskPool(workers=1) as pool:
         backbone = backbone_of(synthetic[0], run)
-        (maps,), _ = backbone._dense([piece], [piece.segment], pool)
-        assert not backbone._depth_task(piece).folder.is_done
+        (maps,), _ = backbone._dense([submodel], [submodel.segment], pool)
+        assert not backbone._depth_task(submodel).folder.is_done
     assert len(maps) == 3
     assert maps.depth(2).shape == (288, 384)
     assert not maps.depth(2).any()

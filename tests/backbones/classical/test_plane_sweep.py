@@ -262,7 +262,7 @@ def test_pixels_without_depth_agree_with_nothing(shots: list[Shot]) -> None:
     assert (check_consistency(camera, holed, [(behind, ones)], tolerance=0.02)[:, :50] == 0).all()
 
 
-# ------------------------------------------------------------------------ whole pieces
+# ------------------------------------------------------------------------ whole submodels
 def test_confident_pixels_are_right_and_wrong_ones_are_not_confident(shots: list[Shot]) -> None:
     for found, shot in zip(reconstruct(shots, sparse_points(shots)), shots, strict=True):
         error = relative_error(found, shot.depth, 2.0)
@@ -278,8 +278,8 @@ def test_confident_pixels_are_right_and_wrong_ones_are_not_confident(shots: list
 def test_an_image_that_moved_by_itself_is_not_believed(shots: list[Shot]) -> None:
     """One image shows another scene: its depth means nothing and nobody confirms it."""
     odd = replace(shots[2], rgb=np.ascontiguousarray(shots[2].rgb[::-1, ::-1]))
-    piece = [*shots[:2], odd, *shots[3:]]
-    found = reconstruct(piece, sparse_points(shots))
+    submodel = [*shots[:2], odd, *shots[3:]]
+    found = reconstruct(submodel, sparse_points(shots))
     assert (found[2].confidence > 2.0).mean() < 0.05
     assert (found[1].confidence > 2.0).mean() > 0.5
 
@@ -404,13 +404,13 @@ def test_images_that_only_turn_get_empty_maps() -> None:
         assert found.rgb.shape == (96, 128, 3)
 
 
-def test_a_piece_of_one_image_or_without_points_gets_empty_maps(shots: list[Shot]) -> None:
+def test_a_submodel_of_one_image_or_without_points_gets_empty_maps(shots: list[Shot]) -> None:
     for found in [*reconstruct(shots[:1], sparse_points(shots[:1])), *reconstruct(shots, no_points())]:
         assert (found.depth == 0).all()
         assert (found.confidence == 1).all()
 
 
-def test_an_image_without_sparse_points_borrows_those_of_the_piece(shots: list[Shot]) -> None:
+def test_an_image_without_sparse_points_borrows_those_of_the_submodel(shots: list[Shot]) -> None:
     tracks = sparse_points(shots)
     others = tracks.image_of_observation != 2
     fewer = replace(

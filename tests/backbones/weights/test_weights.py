@@ -632,11 +632,11 @@ def known_sum(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_a_file_is_sound_only_as_published(tmp_path: Path, name: str, content: bytes, sound: bool, text: str) -> None:
-    verdict = verify(_put(tmp_path / name, content))
+    decision = verify(_put(tmp_path / name, content))
 
-    assert verdict.sound == sound
-    assert text in verdict.text
-    assert str(tmp_path / name) in verdict.text
+    assert decision.sound == sound
+    assert text in decision.text
+    assert str(tmp_path / name) in decision.text
 
 
 def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
