@@ -1,4 +1,4 @@
-"""docs/architecture.md and docs/decisions: every path, module and page that they name exists."""
+"""docs/architecture.md and docs/decisions: every path and module that they name exists."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-REPOSITORY = Path(__file__).resolve().parents[1]
+REPOSITORY = Path(__file__).resolve().parents[2]
 ARCHITECTURE = REPOSITORY / "docs/architecture.md"
 DECISIONS = sorted((REPOSITORY / "docs/decisions").glob("[0-9]*.md"))
 PAGES = [ARCHITECTURE, REPOSITORY / "docs/decisions/README.md", *DECISIONS]
@@ -22,13 +22,6 @@ DIAGRAM = re.compile(r"\(`([^`]+/)`\)[^\n]*(?:\n[^\n`]+)?\n\n```\n(.*?)```", re.
 def test_every_path_on_the_page_exists(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     missing = [path for path in PATH.findall(text) if not (REPOSITORY / path).exists()]
-    assert not missing
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_link_on_the_page_leads_to_a_page(page: Path) -> None:
-    text = page.read_text(encoding="utf-8")
-    missing = [link for link in LINK.findall(text) if not (page.parent / link).is_file()]
     assert not missing
 
 
@@ -58,7 +51,7 @@ def test_every_module_in_a_diagram_of_a_room_exists() -> None:
 
 def _modules(line: str) -> list[str]:
     """The names before the first wide gap of a line."""
-    return re.split(r", ", re.split(r" {2,}", line.strip())[0])
+    return re.split(r" {2,}", line.strip())[0].split(", ")
 
 
 def test_the_index_lists_every_decision_once() -> None:
