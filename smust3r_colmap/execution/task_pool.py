@@ -1,8 +1,11 @@
-"""Running independent pieces of work in child processes.
+"""Tasks in child processes, for two reasons that are kept apart.
 
-pycolmap aborts the whole process when one of its worker threads meets an error, so every risky
-call runs in a child. A child that dies costs its own task and nothing else: the task comes back
-as a ``TaskFailure`` and the rest goes on.
+- *Parallel work*: an ``Executor`` maps a function over tasks. ``TaskPool`` does it with processes of this machine;
+  the stages know ``Run.executor`` only.
+- *Isolation*: pycolmap aborts the whole process when one of its worker threads meets an error, so a risky call runs
+  in a child of its own (``in_child``), on whichever machine needs it.
+
+A child that dies costs its own task and nothing else: the task comes back as a ``TaskFailure`` and the rest goes on.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from smust3r_colmap.errors import SmustrError, StorageError
 
@@ -65,8 +68,25 @@ def usable_cores() -> int:
         return os.cpu_count() or 1
 
 
+class Executor(Protocol):
+    """Maps functions over tasks, wherever they run."""
+
+    @property
+    def workers(self) -> int:
+        """Tasks that may run at once, at least one."""
+
+    def map(self, function: Callable[[TaskT], ResultT], tasks: Sequence[TaskT]) -> Iterator[TaskResult[ResultT]]:
+        """Results of ``function`` over ``tasks`` as they are ready, in any order.
+
+        Args:
+            function: importable at module level; it and the tasks travel by pickle between our own processes.
+        """
+
+
 class TaskPool:
-    """Child processes that stay from one batch of tasks to the next, for starting one takes a second.
+    """The ``Executor`` of this machine: child processes that stay from one batch of tasks to the next.
+
+    Starting a child takes a second.
 
     Children start when there is a first task for them, and end with the ``with`` block.
 
@@ -163,6 +183,20 @@ _open_pools: list[TaskPool] = []
 def living_children_cpu_s() -> float:
     """Processor time that the system does not count as ours yet, because the children that used it live on."""
     return sum(pool.living_cpu_s for pool in _open_pools)
+
+
+def in_child(
+    function: Callable[[TaskT], ResultT], task: TaskT, *, log_file: Path | None = None
+) -> ResultT | TaskFailure:
+    """The result of one call in a child process of its own, so that a crash of native code stays there.
+
+    Args:
+        function: importable at module level; it and the task travel by pickle.
+        log_file: where native code writes its messages; None throws them away.
+    """
+    with TaskPool(workers=1, log_file=log_file) as pool:
+        (result,) = pool.map(function, [task])
+    return result.value
 
 
 def map_tasks(
