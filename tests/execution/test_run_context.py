@@ -47,7 +47,9 @@ def test_a_stage_that_failed_is_computed_at_the_next_start(tmp_path: Path) -> No
     def fail(progress: Stage) -> tuple[int, ...]:
         raise ValueError("no")
 
-    with Run.open(tmp_path / "run", workers=1, seed=0, reporter=QuietReporter(io.StringIO())) as run:
-        with pytest.raises(ValueError, match="no"):
-            run.cached("squares", (1,), fail, NUMBERS)
+    with (
+        pytest.raises(ValueError, match="no"),
+        Run.open(tmp_path / "run", workers=1, seed=0, reporter=QuietReporter(io.StringIO())) as run,
+    ):
+        run.cached("squares", (1,), fail, NUMBERS)
     assert squares(tmp_path / "run", (1,), []) == ((1,), False)
