@@ -241,7 +241,7 @@ def solve(
     edges = align_submodels(
         result.submodels,
         result.dense,
-        result.links,
+        result.matches,
         config.alignment,
         loop_segments=loop_segments,
         seed=config.seed,

@@ -253,7 +253,7 @@ def _align(
         (submodel.name, submodel.images, submodel.seg_from_cam, submodel.tracks) for submodel in result.submodels
     ]
     maps = result.dense_key if needs_maps(result.submodels, config.alignment) else None
-    inputs = (geometry, maps, result.links, sorted(loops))
+    inputs = (geometry, maps, result.matches, sorted(loops))
     stored = run.stage("alignment", key=key_of("alignment", inputs, config.alignment, config.seed))
     with clock.stage("alignment", total=num_pairs) as stage:
         if stored.is_done:
@@ -262,7 +262,7 @@ def _align(
             edges = align_submodels(
                 result.submodels,
                 result.dense,
-                result.links,
+                result.matches,
                 config.alignment,
                 loop_segments=loops,
                 seed=config.seed,

@@ -206,8 +206,8 @@ class RunFeatures:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FeatureLinks:
-    """Verified matches between features of two images, which tie submodels that share no image.
+class InterSegmentMatches:
+    """Verified matches between features of two images; they align submodels that share no image.
 
     Args:
         image_a, feature_a, image_b, feature_b: (M,) each; images are indices into the collection,
@@ -222,7 +222,7 @@ class FeatureLinks:
     def __post_init__(self) -> None:
         shapes = {self.image_a.shape, self.feature_a.shape, self.image_b.shape, self.feature_b.shape}
         if len(shapes) != 1 or self.image_a.ndim != 1:
-            raise ValueError(f"FeatureLinks: arrays of shapes {sorted(shapes)}, needed (M,) each")
+            raise ValueError(f"InterSegmentMatches: arrays of shapes {sorted(shapes)}, needed (M,) each")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -331,7 +331,7 @@ class SegmentAlignment:
     Args:
         target, source: positions in the list of all submodels of the run.
         estimate: ``target_from_source`` with its evidence.
-        evidence: ``"tracks"``, ``"pointmaps"``, ``"poses"`` of the shared images' cameras, or ``"links"``
+        evidence: ``"tracks"``, ``"pointmaps"``, ``"poses"`` of the shared images' cameras, or ``"matches"``
             (matches between images).
         relative_residual: median residual divided by depth, the test of a sound edge.
         information: (d, d) inverse covariance of the right perturbation, correlated errors and the bending

@@ -1,6 +1,6 @@
 """Aligning two submodels by feature tracks: points that both saw as the same feature of the same image.
 
-`align_tracks` needs shared images. `match_links` is the bridge between submodels that share none, or
+`align_tracks` needs shared images. `align_matches` is the bridge between submodels that share none, or
 too few: a verified two-view match says that a feature here and a feature there are one point.
 The solver is behind ``seen_points``; ``from_pointmaps`` does the same for dense maps.
 """
@@ -18,9 +18,9 @@ from smust3r_colmap.products import Submodel, Tracks
 
 MAX_VOTES = 5
 """Shared observations of a point pair that count: more of them make the pairing no surer."""
-MAX_LINK_ERROR = 0.25
-"""Residual over depth at the robust start beyond which a link counts as a wrong match: five times the
-agreement the start asks for. Links start far off and may be wrong in their majority."""
+MAX_MATCH_RELATIVE_ERROR = 0.25
+"""Residual over depth at the robust start beyond which a match counts as wrong: five times the agreement
+that the start asks for. Most matches between submodels may be wrong."""
 _KEY_SHIFT = np.int64(2**32)
 
 
@@ -53,7 +53,7 @@ def align_tracks(target: Submodel, source: Submodel, settings: AlignmentConfig, 
     )
 
 
-def match_links(
+def align_matches(
     target: Submodel,
     source: Submodel,
     settings: AlignmentConfig,
@@ -66,9 +66,9 @@ def match_links(
 ) -> SubmodelFit:
     """Robust ``target_from_source`` from two-view matches between images of the two submodels.
 
-    A match links the target's point behind (image_a, feature_a) to the source's point behind
+    A match pairs the target's point behind (image_a, feature_a) to the source's point behind
     (image_b, feature_b); matches with a feature that is part of no point are passed over. With the
-    redescending kernels links further than a quarter of their depth from the robust start are left
+    redescending kernels matches further than a quarter of their depth from the robust start are left
     out; they still count in ``num_correspondences`` and ``relative_residual``.
 
     Args:
@@ -78,7 +78,7 @@ def match_links(
         seed: of the search for a robust start.
 
     Raises:
-        DegenerateAlignmentError: too few points are linked, or they do not determine the transform.
+        DegenerateAlignmentError: too few points are matched, or they do not determine the transform.
         ValueError: the arrays differ in length, or a submodel has no or external tracks.
     """
     arrays = [np.asarray(values, dtype=np.int64) for values in (image_a, feature_a, image_b, feature_b)]
@@ -86,15 +86,15 @@ def match_links(
         raise ValueError(f"matches: arrays of shapes {[values.shape for values in arrays]}, needed (M,) each")
     point_target = _points_behind(_tracks(target), arrays[0], arrays[1])
     point_source = _points_behind(_tracks(source), arrays[2], arrays[3])
-    linked = (point_target >= 0) & (point_source >= 0)
+    matched = (point_target >= 0) & (point_source >= 0)
     return _align_point_pairs(
         target,
         source,
-        point_target[linked],
-        point_source[linked],
+        point_target[matched],
+        point_source[matched],
         settings,
-        evidence="points linked by matches",
-        max_start_error=MAX_LINK_ERROR,
+        evidence="matched points",
+        max_start_error=MAX_MATCH_RELATIVE_ERROR,
         seed=seed,
     )
 

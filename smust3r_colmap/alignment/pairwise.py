@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from smust3r_colmap.alignment.from_pointmaps import align_pointmaps
 from smust3r_colmap.alignment.from_poses import align_poses
-from smust3r_colmap.alignment.from_tracks import align_tracks, match_links, point_depths
+from smust3r_colmap.alignment.from_tracks import align_matches, align_tracks, point_depths
 from smust3r_colmap.alignment.seen_points import SubmodelFit
 from smust3r_colmap.alignment.uncertainty import honest_information, overlap_centre
 from smust3r_colmap.config import AlignmentConfig
@@ -31,7 +31,7 @@ from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import (
     DenseMaps,
     Edges,
-    FeatureLinks,
+    InterSegmentMatches,
     SegmentAlignment,
     Submodel,
     TransformEstimate,
@@ -45,12 +45,12 @@ MAX_RELATIVE_RESIDUAL = 0.05
 (measured on six real sets)."""
 MIN_SHARED_TRACKS = 30
 """Fewer common points than COLMAP wants for one image do not carry a segment."""
-MIN_LINK_INLIERS = 12
+MIN_MATCH_INLIERS = 12
 """Inliers of an edge that rests on matches between images; a Sim(3) needs 3."""
-MIN_LINK_SHARE = 0.3
-"""Share of the linked points that must fit; wrong matches agree on nothing."""
-MIN_POSE_SHARE = 0.3
-"""Share of the shared cameras that must fit, centre and orientation; a broken pair had 3 of 14."""
+MIN_MATCH_INLIER_RATIO = 0.3
+"""Inliers over matched points; wrong matches agree on nothing."""
+MIN_POSE_INLIER_RATIO = 0.3
+"""Inliers over shared cameras, by centre and orientation; a broken pair had 3 of 14."""
 MAX_DISAGREEMENT_SIGMAS = 5.0
 """Between the edge from points and the one from cameras, per degree of freedom."""
 DEPTH_IMAGES = 8
@@ -62,7 +62,7 @@ MAX_CAMERA_TURN_DEG = 10.0
 def align_submodels(
     submodels: Sequence[Submodel],
     dense: Sequence[DenseMaps],
-    links: FeatureLinks | None,
+    matches: InterSegmentMatches | None,
     settings: AlignmentConfig,
     *,
     loop_segments: Collection[int] = (),
@@ -77,13 +77,13 @@ def align_submodels(
 
     Args:
         submodels: all of the run. dense: their maps, in the same order.
-        links: verified matches, for submodels that share too few images; None where there are none.
+        matches: verified matches, for submodels that share too few images; None where there are none.
         settings: group, kinds of edges, source of correspondences, kernel, weighting.
         loop_segments: indices of the segments that are loops, not windows of the sequence.
         seed: of the searches for a robust start.
         advance: called with 1 after each pair of ``candidate_pairs``.
     """
-    aligner = _Aligner(submodels=submodels, dense=dense, links=links, settings=settings, seed=seed)
+    aligner = _Aligner(submodels=submodels, dense=dense, matches=matches, settings=settings, seed=seed)
     outcomes: list[SegmentAlignment | TriedAlignment] = []
     for target, source in candidate_pairs(submodels, loop_segments):
         outcomes += aligner.align(target, source)
@@ -121,7 +121,7 @@ class _Aligner:
 
     submodels: Sequence[Submodel]
     dense: Sequence[DenseMaps]
-    links: FeatureLinks | None
+    matches: InterSegmentMatches | None
     settings: AlignmentConfig
     seed: int
     _depths: dict[int, float] = field(default_factory=dict)
@@ -133,8 +133,8 @@ class _Aligner:
         if self.settings.alignment_edges != "poses":
             if shared:
                 outcomes.append(self._by_points(target, source))
-            if not any(_is_accepted(one) for one in outcomes) and self._has_links(target, source):
-                outcomes.append(self._by_links(target, source))
+            if not any(_is_accepted(one) for one in outcomes) and self._has_matches(target, source):
+                outcomes.append(self._by_matches(target, source))
         if shared and self.settings.alignment_edges != "points":
             outcomes.append(self._by_poses(target, source, beside=tuple(outcomes)))
         return outcomes
@@ -151,18 +151,18 @@ class _Aligner:
         except DegenerateAlignmentError as error:
             return TriedAlignment(target=target, source=source, evidence=evidence, reason=str(error))
 
-    def _has_links(self, target: int, source: int) -> bool:
+    def _has_matches(self, target: int, source: int) -> bool:
         tracks = (self.submodels[target].tracks, self.submodels[source].tracks)
-        return self.links is not None and None not in tracks
+        return self.matches is not None and None not in tracks
 
-    def _by_links(self, target: int, source: int) -> SegmentAlignment | TriedAlignment:
-        assert self.links is not None
+    def _by_matches(self, target: int, source: int) -> SegmentAlignment | TriedAlignment:
+        assert self.matches is not None
         a, b = self.submodels[target], self.submodels[source]
         try:
-            fit = _align_by_links(a, b, self.links, self.settings, self.seed)
+            fit = _align_by_matches(a, b, self.matches, self.settings, self.seed)
         except DegenerateAlignmentError as error:
-            return TriedAlignment(target=target, source=source, evidence="links", reason=str(error))
-        return self._edge(target, source, fit, "links", _refusal_of_links(a, b, fit))
+            return TriedAlignment(target=target, source=source, evidence="matches", reason=str(error))
+        return self._edge(target, source, fit, "matches", _refusal_of_matches(a, b, fit))
 
     def _by_poses(
         self, target: int, source: int, *, beside: Sequence[SegmentAlignment | TriedAlignment]
@@ -250,23 +250,25 @@ def _evidence(a: Submodel, b: Submodel, settings: AlignmentConfig) -> str:
     return "tracks" if a.tracks is not None and b.tracks is not None else "pointmaps"
 
 
-def _align_by_links(a: Submodel, b: Submodel, links: FeatureLinks, settings: AlignmentConfig, seed: int) -> SubmodelFit:
+def _align_by_matches(
+    a: Submodel, b: Submodel, matches: InterSegmentMatches, settings: AlignmentConfig, seed: int
+) -> SubmodelFit:
     """Matches run from the lower to the higher image; take them both ways."""
     in_a, in_b = np.array(a.images), np.array(b.images)
-    forward = np.isin(links.image_a, in_a) & np.isin(links.image_b, in_b)
-    backward = np.isin(links.image_b, in_a) & np.isin(links.image_a, in_b)
+    forward = np.isin(matches.image_a, in_a) & np.isin(matches.image_b, in_b)
+    backward = np.isin(matches.image_b, in_a) & np.isin(matches.image_a, in_b)
 
     def both(first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         return np.concatenate([first[forward], second[backward]])
 
-    return match_links(
+    return align_matches(
         a,
         b,
         settings,
-        image_a=both(links.image_a, links.image_b),
-        feature_a=both(links.feature_a, links.feature_b),
-        image_b=both(links.image_b, links.image_a),
-        feature_b=both(links.feature_b, links.feature_a),
+        image_a=both(matches.image_a, matches.image_b),
+        feature_a=both(matches.feature_a, matches.feature_b),
+        image_b=both(matches.image_b, matches.image_a),
+        feature_b=both(matches.feature_b, matches.feature_a),
         seed=seed,
     )
 
@@ -289,12 +291,12 @@ def _camera_refusal(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
     return ""
 
 
-def _refusal_of_links(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
+def _refusal_of_matches(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
     """The same for an edge from matches; cameras that are shared all the same have to agree."""
-    if fit.estimate.num_inliers < MIN_LINK_INLIERS:
-        return f"{fit.estimate.num_inliers} matched points fit, needed {MIN_LINK_INLIERS}"
-    if fit.inlier_share < MIN_LINK_SHARE:
-        return f"{fit.inlier_share:.0%} of the matched points fit, needed {MIN_LINK_SHARE:.0%}"
+    if fit.estimate.num_inliers < MIN_MATCH_INLIERS:
+        return f"{fit.estimate.num_inliers} matched points fit, needed {MIN_MATCH_INLIERS}"
+    if fit.inlier_share < MIN_MATCH_INLIER_RATIO:
+        return f"{fit.inlier_share:.0%} of the matched points fit, needed {MIN_MATCH_INLIER_RATIO:.0%}"
     return _camera_refusal(a, b, fit)
 
 
@@ -302,8 +304,8 @@ def _refusal_of_poses(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
     """The same for an edge from cameras."""
     if not fit.relative_residual <= MAX_RELATIVE_RESIDUAL:
         return f"the centres differ by {fit.relative_residual:.3f} of the depth, at most {MAX_RELATIVE_RESIDUAL}"
-    if fit.inlier_share < MIN_POSE_SHARE:
-        return f"{fit.inlier_share:.0%} of {fit.num_correspondences} cameras fit, needed {MIN_POSE_SHARE:.0%}"
+    if fit.inlier_share < MIN_POSE_INLIER_RATIO:
+        return f"{fit.inlier_share:.0%} of {fit.num_correspondences} cameras fit, needed {MIN_POSE_INLIER_RATIO:.0%}"
     return _camera_refusal(a, b, fit)
 
 

@@ -17,8 +17,8 @@ from smust3r_colmap.config import RunConfig
 from smust3r_colmap.execution.progress import Reporter
 from smust3r_colmap.products import (
     DenseMaps,
-    FeatureLinks,
     ImageCollection,
+    InterSegmentMatches,
     RejectedImage,
     RunFeatures,
     Segment,
@@ -36,7 +36,7 @@ class BackboneResult:
         reconstructions: one per segment, in order.
         dense: maps of every submodel, in the order in which ``submodels`` lists them.
         dense_key: hash of all that the maps were made from.
-        links: verified matches, where the backbone has features.
+        matches: verified matches, where the backbone has features.
         rejected: images that the backbone could not use at all.
         features: where the backbone has SIFT features of all images.
     """
@@ -44,7 +44,7 @@ class BackboneResult:
     reconstructions: tuple[SegmentReconstruction, ...]
     dense: tuple[DenseMaps, ...]
     dense_key: str
-    links: FeatureLinks | None
+    matches: InterSegmentMatches | None
     rejected: tuple[RejectedImage, ...]
     features: RunFeatures | None = None
 

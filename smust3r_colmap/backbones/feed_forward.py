@@ -175,7 +175,7 @@ class FeedForwardBackbone:
             reconstructions=tuple(reconstruction for reconstruction, _ in read),
             dense=tuple(maps for _, of_submodel in read for maps in of_submodel),
             dense_key=key_of([folder.key for folder in folders]),
-            links=None,
+            matches=None,
             rejected=(),
         )
 

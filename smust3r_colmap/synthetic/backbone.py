@@ -231,7 +231,7 @@ class OracleBackbone:
             reconstructions=tuple(reconstruction for reconstruction, _ in made),
             dense=tuple(maps for _, maps in made if maps is not None),
             dense_key=key_of("oracle", self.truth.digest, self.settings, self.seed, segments),
-            links=None,
+            matches=None,
             rejected=(),
         )
 

@@ -10,7 +10,7 @@ from smust3r_colmap.config import AlignmentConfig, AlignmentEdges, TransformGrou
 from smust3r_colmap.geometry.affine3 import Affine3
 from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.sim3 import Sim3
-from smust3r_colmap.products import Edges, FeatureLinks, Submodel
+from smust3r_colmap.products import Edges, InterSegmentMatches, Submodel
 from smust3r_colmap.storage.alignments import read_edges, write_edges
 
 
@@ -35,9 +35,11 @@ def two_submodels(
     return a, b, a_from_world @ b_from_world.inverse()
 
 
-def align(a: Submodel, b: Submodel, links: FeatureLinks | None = None, *, edges: AlignmentEdges = "points") -> Edges:
+def align(
+    a: Submodel, b: Submodel, matches: InterSegmentMatches | None = None, *, edges: AlignmentEdges = "points"
+) -> Edges:
     settings = AlignmentConfig(alignment_edges=edges)
-    return align_submodels([a, b], [], links, settings, seed=0, advance=Counter())
+    return align_submodels([a, b], [], matches, settings, seed=0, advance=Counter())
 
 
 def test_submodels_that_share_images_are_joined_by_their_tracks() -> None:
@@ -50,17 +52,17 @@ def test_submodels_that_share_images_are_joined_by_their_tracks() -> None:
 def test_submodels_without_shared_images_are_joined_by_matches() -> None:
     a, b, a_from_b = two_submodels(range(9), range(9, 18))
     feature = np.arange(60)
-    links = FeatureLinks(image_a=np.full(60, 8), feature_a=feature, image_b=np.full(60, 9), feature_b=feature)
-    (found,) = align(a, b, links).alignments
-    assert (found.accepted, found.evidence) == (True, "links")
+    matches = InterSegmentMatches(image_a=np.full(60, 8), feature_a=feature, image_b=np.full(60, 9), feature_b=feature)
+    (found,) = align(a, b, matches).alignments
+    assert (found.accepted, found.evidence) == (True, "matches")
     np.testing.assert_allclose(found.estimate.b_from_a.matrix, a_from_b.matrix, rtol=1e-6, atol=1e-6)
 
 
 def test_matches_count_in_both_directions() -> None:
     a, b, a_from_b = two_submodels(range(9, 18), range(9))
     feature = np.arange(60)
-    links = FeatureLinks(image_a=np.full(60, 8), feature_a=feature, image_b=np.full(60, 9), feature_b=feature)
-    (found,) = align(a, b, links).alignments
+    matches = InterSegmentMatches(image_a=np.full(60, 8), feature_a=feature, image_b=np.full(60, 9), feature_b=feature)
+    (found,) = align(a, b, matches).alignments
     assert found.accepted
     np.testing.assert_allclose(found.estimate.b_from_a.matrix, a_from_b.matrix, rtol=1e-6, atol=1e-6)
 
@@ -68,8 +70,8 @@ def test_matches_count_in_both_directions() -> None:
 def test_too_few_matching_points_are_refused_with_their_number() -> None:
     a, b, _ = two_submodels(range(9), range(9, 18))
     feature = np.arange(8)
-    links = FeatureLinks(image_a=np.full(8, 8), feature_a=feature, image_b=np.full(8, 9), feature_b=feature)
-    (found,) = align(a, b, links).alignments
+    matches = InterSegmentMatches(image_a=np.full(8, 8), feature_a=feature, image_b=np.full(8, 9), feature_b=feature)
+    (found,) = align(a, b, matches).alignments
     assert not found.accepted
     assert found.reason == "8 matched points fit, needed 12"
 
@@ -77,10 +79,10 @@ def test_too_few_matching_points_are_refused_with_their_number() -> None:
 def test_submodels_with_nothing_in_common_are_reported() -> None:
     a, b, _ = two_submodels(range(9), range(9, 18))
     nothing = np.zeros(0, np.int64)
-    edges = align(a, b, FeatureLinks(image_a=nothing, feature_a=nothing, image_b=nothing, feature_b=nothing))
+    edges = align(a, b, InterSegmentMatches(image_a=nothing, feature_a=nothing, image_b=nothing, feature_b=nothing))
     assert not edges.alignments
     (failure,) = edges.failures
-    assert failure.evidence == "links"
+    assert failure.evidence == "matches"
     assert "0" in failure.reason
 
 

@@ -134,7 +134,7 @@ def test_a_prediction_comes_back_as_one_submodel_with_its_maps(tmp_path: Path) -
     result = start(tmp_path / "run", CountingNetwork(), WINDOW, LOOP)
     assert [one.segment for one in result.reconstructions] == [0, 1]
     assert all(one.metric and not one.unregistered and not one.warnings for one in result.reconstructions)
-    assert (result.links, result.rejected, len(result.dense)) == (None, (), 2)
+    assert (result.matches, result.rejected, len(result.dense)) == (None, (), 2)
     for segment, submodel, maps in zip((WINDOW, LOOP), result.submodels, result.dense, strict=True):
         assert submodel.images == segment.images
         assert (submodel.method, submodel.tracks) == ("looked", None)

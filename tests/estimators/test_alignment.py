@@ -13,7 +13,7 @@ from helpers.room_overlap import SIMILARITY as SOURCE_FROM_TARGET
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.alignment.from_pointmaps import align_pointmaps
-from smust3r_colmap.alignment.from_tracks import align_tracks, match_links, point_depths
+from smust3r_colmap.alignment.from_tracks import align_matches, align_tracks, point_depths
 from smust3r_colmap.alignment.seen_points import SubmodelFit, align_seen_points
 from smust3r_colmap.config import AlignmentConfig, RobustKernel, TransformGroup
 from smust3r_colmap.errors import DegenerateAlignmentError, ReconstructionError
@@ -24,7 +24,7 @@ from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.products import FeatureLinks, Submodel, Tracks, TransformEstimate
+from smust3r_colmap.products import InterSegmentMatches, Submodel, Tracks, TransformEstimate
 
 KERNELS: tuple[RobustKernel, ...] = get_args(RobustKernel)
 REDESCENDING: tuple[RobustKernel, ...] = ("cauchy", "tukey")
@@ -621,13 +621,13 @@ def test_submodels_without_usable_tracks_are_refused() -> None:
         align_tracks(target, external, AlignmentConfig())
 
 
-# ---------------------------------------------------------------------------------- links
-def links_between(wrong: float, *, seed: int = 0) -> FeatureLinks:
+# -------------------------------------------------------------------------------- matches
+def matches_between(wrong: float, *, seed: int = 0) -> InterSegmentMatches:
     """Matches of image 1 of one submodel with image 5 of the other; the wrong ones name any feature."""
     rng = np.random.default_rng(seed)
     point = np.arange(NUM_POINTS)
     other = np.where(rng.random(NUM_POINTS) < wrong, rng.integers(0, NUM_POINTS, NUM_POINTS), point)
-    return FeatureLinks(
+    return InterSegmentMatches(
         image_a=np.full(NUM_POINTS, 1),
         feature_a=(point * 7 + 1) % NUM_POINTS,
         image_b=np.full(NUM_POINTS, 5),
@@ -635,25 +635,27 @@ def links_between(wrong: float, *, seed: int = 0) -> FeatureLinks:
     )
 
 
-def fit_to_links(target: Submodel, source: Submodel, links: FeatureLinks, settings: AlignmentConfig) -> SubmodelFit:
-    return match_links(
+def fit_to_matches(
+    target: Submodel, source: Submodel, matches: InterSegmentMatches, settings: AlignmentConfig
+) -> SubmodelFit:
+    return align_matches(
         target,
         source,
         settings,
-        image_a=links.image_a,
-        feature_a=links.feature_a,
-        image_b=links.image_b,
-        feature_b=links.feature_b,
+        image_a=matches.image_a,
+        feature_a=matches.feature_a,
+        image_b=matches.image_b,
+        feature_b=matches.feature_b,
     )
 
 
 @pytest.mark.parametrize("kernel", REDESCENDING)
 @pytest.mark.parametrize("wrong", [0.4, 0.7])
-def test_match_links_survive_wrong_links(kernel: RobustKernel, wrong: float) -> None:
+def test_align_matches_survives_wrong_matches(kernel: RobustKernel, wrong: float) -> None:
     target = track_submodel((0, 1, 2), Sim3.identity(), segment=0, noise=0.005)
     source = track_submodel((4, 5, 6), SOURCE_FROM_TARGET, segment=1, noise=0.005)
     settings = AlignmentConfig(robust_kernel=kernel)
-    fit = fit_to_links(target, source, links_between(wrong), settings)
+    fit = fit_to_matches(target, source, matches_between(wrong), settings)
     assert float(sim3_of(fit.estimate).scale) == pytest.approx(1 / 1.7, rel=4e-3)
     np.testing.assert_allclose(sim3_of(fit.estimate).rotation, TARGET_FROM_SOURCE.rotation, atol=5e-3)
     assert fit.num_correspondences == NUM_POINTS
@@ -661,27 +663,27 @@ def test_match_links_survive_wrong_links(kernel: RobustKernel, wrong: float) -> 
     assert (fit.relative_residual < 0.05) == (wrong < 0.5)
 
 
-def test_match_links_without_noise_or_wrong_links_are_exact() -> None:
+def test_align_matches_without_noise_or_wrong_matches_is_exact() -> None:
     target = track_submodel((0, 1, 2), Sim3.identity(), segment=0)
     source = track_submodel((4, 5, 6), SOURCE_FROM_TARGET, segment=1)
-    fit = fit_to_links(target, source, links_between(0.0), AlignmentConfig())
+    fit = fit_to_matches(target, source, matches_between(0.0), AlignmentConfig())
     assert_close(fit.estimate.b_from_a, TARGET_FROM_SOURCE, 1e-9)
 
 
-def test_links_to_no_point_are_passed_over() -> None:
+def test_matches_of_no_point_are_ignored() -> None:
     target = track_submodel((0, 1, 2), Sim3.identity(), segment=0)
     source = track_submodel((4, 5, 6), SOURCE_FROM_TARGET, segment=1)
-    links = links_between(0.0)
-    links.feature_a[:50] += 10_000
-    links.image_b[50:70] = 77
-    assert fit_to_links(target, source, links, AlignmentConfig()).num_correspondences == NUM_POINTS - 70
-    links.image_b[:] = 77
-    with pytest.raises(DegenerateAlignmentError, match="submodels 0 and 1, points linked by matches: 0 point pairs"):
-        fit_to_links(target, source, links, AlignmentConfig())
+    matches = matches_between(0.0)
+    matches.feature_a[:50] += 10_000
+    matches.image_b[50:70] = 77
+    assert fit_to_matches(target, source, matches, AlignmentConfig()).num_correspondences == NUM_POINTS - 70
+    matches.image_b[:] = 77
+    with pytest.raises(DegenerateAlignmentError, match="submodels 0 and 1, matched points: 0 point pairs"):
+        fit_to_matches(target, source, matches, AlignmentConfig())
 
 
-def test_links_of_different_length_are_refused() -> None:
+def test_matches_of_different_length_are_refused() -> None:
     target = track_submodel((0, 1), Sim3.identity(), segment=0)
     row = np.zeros(5, dtype=np.int64)
     with pytest.raises(ValueError, match=r"needed \(M,\) each"):
-        match_links(target, target, AlignmentConfig(), image_a=row, feature_a=row, image_b=row[:-1], feature_b=row)
+        align_matches(target, target, AlignmentConfig(), image_a=row, feature_a=row, image_b=row[:-1], feature_b=row)

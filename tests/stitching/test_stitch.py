@@ -333,7 +333,7 @@ def test_a_chain_that_cannot_be_drawn_costs_the_comparison_and_not_the_run(monke
         for submodel in ring.submodels
     )
     maps = tuple(EmptyMaps(submodel, longer_side=8) for submodel in ring.submodels)
-    result = BackboneResult(reconstructions=reconstructions, dense=maps, dense_key="", links=None, rejected=())
+    result = BackboneResult(reconstructions=reconstructions, dense=maps, dense_key="", matches=None, rejected=())
 
     def beyond_infinity(*_: object) -> None:
         raise DegenerateAlignmentError("2 of 16 cameras lie beyond the plane that the transform sends to infinity")

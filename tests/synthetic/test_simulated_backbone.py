@@ -149,7 +149,7 @@ def test_an_oracle_is_a_backbone(truth: TrueScene) -> None:
     backbone: Backbone = oracle(truth, PERFECT)
     assert (backbone.name, backbone.metric, backbone.has_tracks) == ("oracle", True, False)
     result = backbone.reconstruct([WINDOW], with_maps=[])
-    assert result.links is None
+    assert result.matches is None
     assert result.rejected == ()
     assert result.reconstructions[0].metric
 

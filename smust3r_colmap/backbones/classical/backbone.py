@@ -36,8 +36,8 @@ from smust3r_colmap.geometry.arrays import Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import (
     DenseMaps,
-    FeatureLinks,
     ImageCollection,
+    InterSegmentMatches,
     RunFeatures,
     Segment,
     SegmentKind,
@@ -101,7 +101,7 @@ class ClassicalBackbone:
             reconstructions=tuple(reconstructions),
             dense=dense,
             dense_key=dense_key,
-            links=_read_links(self._features.database, sorted(set().union(*pairs.values()))),
+            matches=_read_matches(self._features.database, sorted(set().union(*pairs.values()))),
             rejected=self._features.rejected,
             features=self._features,
         )
@@ -371,7 +371,7 @@ def _reconstruction(mapped: MappedSegment) -> SegmentReconstruction:
     )
 
 
-def _read_links(database: Path, pairs: Sequence[Pair]) -> FeatureLinks:
+def _read_matches(database: Path, pairs: Sequence[Pair]) -> InterSegmentMatches:
     """The verified matches of all pairs of the plan."""
     columns: list[list[npt.NDArray[np.int64]]] = [[], [], [], []]
     with open_database(database) as opened:
@@ -385,7 +385,7 @@ def _read_links(database: Path, pairs: Sequence[Pair]) -> FeatureLinks:
             columns[3].append(matches[:, 1])
     empty = np.zeros(0, dtype=np.int64)
     joined = [np.concatenate([empty, *column]) for column in columns]
-    return FeatureLinks(image_a=joined[0], feature_a=joined[1], image_b=joined[2], feature_b=joined[3])
+    return InterSegmentMatches(image_a=joined[0], feature_a=joined[1], image_b=joined[2], feature_b=joined[3])
 
 
 def make_classical(context: BackboneContext) -> ClassicalBackbone:
