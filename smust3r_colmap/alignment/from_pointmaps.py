@@ -26,7 +26,7 @@ NUM_PIXELS = 8_000
 """Correspondences per pair of submodels; 5,000 to 20,000 measured alike, and the cost is 0.08 CPU s."""
 CANDIDATES_PER_PIXEL = 2
 """Pixels looked at for each one wanted; half of them may lack depth or confidence."""
-CONFIDENCE_SHARE = 0.5
+MIN_CONFIDENCE_RATIO = 0.5
 """Of the median confidence of a submodel, which a pixel must exceed on both sides. It drops the low tail
 and, by construction, never more than half of a side; VGGT-Long's tenth of the median drops nothing
 where confidences start at 1."""
@@ -175,5 +175,5 @@ def _confident(side: _Side) -> npt.NDArray[np.bool_]:
     """(N,) pixels above the share of the median; none of none."""
     if len(side.confidence) == 0:
         return np.zeros(0, dtype=bool)
-    above: npt.NDArray[np.bool_] = side.confidence > CONFIDENCE_SHARE * np.median(side.confidence)
+    above: npt.NDArray[np.bool_] = side.confidence > MIN_CONFIDENCE_RATIO * np.median(side.confidence)
     return above

@@ -2,8 +2,8 @@
 
 Centres alone leave the roll about a straight path free, so orientations take part: every camera of
 both submodels is a rotation and a point. It costs milliseconds and needs neither tracks nor maps;
-how far to believe it is a matter for ``uncertainty``.
-The solver works like that in ``irls``; the next module to read is ``edges``.
+``uncertainty`` has its covariance.
+The solver works like that in ``estimators.sim3``; the next module to read is ``pairwise``.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from smust3r_colmap.products import Submodel, TransformEstimate
 
 PoseGroup = Literal["sim3", "se3"]
 
-USUAL_ERROR = 0.001
-"""Usual error of an orientation about one axis in radians, and of a coordinate of a centre over the depth:
-medians of 59 overlaps of six sets are 0.0006 and 0.0004."""
+PRIOR_SIGMA = 0.001
+"""Prior standard deviation of an orientation about one axis in radians, and of a coordinate of a centre over
+the depth: medians of 59 overlaps of six sets are 0.0006 and 0.0004."""
 PRIOR_CAMERAS = 1.0
-"""The usual error counts as much as what this many cameras say of theirs."""
+"""Weight of the prior, in cameras."""
 HUBER_TUNING = 1.345
 """Where Huber's loss turns linear, in standard deviations: 95 % efficient on Gaussian noise."""
-MIN_SPREAD = 3.0
+MIN_SPREAD_SIGMAS = 3.0
 """Root mean square distance of the centres from their mean, in standard deviations of one coordinate,
 from which they carry a scale. Noise alone has 1.2: both sides' errors are in the residual."""
-START_CAMERAS = 60
+MAX_START_CAMERAS = 60
 """Cameras among which every pair is tried for the start: 1,770 pairs."""
 SCALE_ITERATIONS = 30
 """The sigmas are taken anew this many times; of few cameras the median may alternate between two forever."""
@@ -61,16 +61,15 @@ def align_poses(
 
         sum_k rho(|c_target,k - T c_source,k| / sigma_c) + rho(angle(R_target,k, R R_source,k) / sigma_r).
 
-    Both sigmas come from the residuals themselves, so centres and orientations weigh what they are
-    worth and no unit enters. What keeps a sigma from vanishing where the fit leaves nothing (two
-    cameras always fit in their centres) is a usual error worth one camera: for orientations an angle,
-    for centres a part of the *depth of the scene*. The spread of the centres would be the wrong
-    yardstick: the error of a centre comes from pixels and grows with the depth, however far the
-    camera walked; and an orientation off by an angle comes with a centre off by that angle times the
-    depth, which makes the two terms one in kind.
+    Both sigmas are estimated from the residuals, so no unit enters. A prior of the weight of one camera
+    keeps a sigma from vanishing where the residuals are zero (two cameras always fit in their centres):
+    for orientations an angle, for centres a fraction of the *depth of the scene*. The spread of the
+    centres would be the wrong unit: the error of a centre comes from pixels and grows with the depth,
+    whatever the length of the path; and an orientation off by an angle comes with a centre off by that
+    angle times the depth, so the two terms are of one kind.
 
-    Wrong cameras are outvoted: the start is the median of the rotations that each camera gives,
-    then scale and translation of the pair of cameras with the least median residual. ``huber`` turns
+    The start is robust: the median of the rotations of all cameras, then scale and translation of the
+    pair of cameras with the least median residual. ``huber`` turns
     linear at 1.345 sigma here: the paper's fixed delta has no meaning for an angle.
 
     Args:
@@ -218,7 +217,7 @@ def _start(pairs: _Cameras, *, fixed_scale: bool) -> Sim3:
     """
     rotation = _median_rotation(pairs.rotations_b @ np.swapaxes(pairs.rotations_a, 1, 2))
     turned, given = pairs.centres_a @ rotation.T, pairs.centres_b
-    chosen = evenly_chosen(len(pairs), START_CAMERAS)
+    chosen = evenly_chosen(len(pairs), MAX_START_CAMERAS)
     if fixed_scale:
         scales, anchor_a, anchor_b = np.full(len(chosen), 1 / pairs.depth), turned[chosen], given[chosen]
     else:
@@ -279,15 +278,15 @@ def _sigmas(pairs: _Cameras, fit: Sim3, *, fixed_scale: bool) -> tuple[float, fl
 def _sigma(norms: FloatArray, num_parameters: int) -> float:
     """Robust standard deviation of one coordinate of the residual vectors that have these norms.
 
-    From their median, of those within three standard deviations as in ``irls``, with the fit's
-    degrees of freedom given back, and joined by the usual one as by `PRIOR_CAMERAS` more cameras.
+    From their median, of those within three standard deviations as in ``estimators.sim3``, with the
+    correction for degrees of freedom, and with `PRIOR_SIGMA` as `PRIOR_CAMERAS` more cameras.
     """
     rising, num_cameras = np.sort(norms), len(norms)
     per_norm = np.sqrt(6 * num_cameras / max(6 * num_cameras - num_parameters, 1)) / MEDIAN_OF_NORM
     num_near = num_cameras
     for _ in range(TRIMMING_ROUNDS):
         own = per_norm * (rising[(num_near - 1) // 2] + rising[num_near // 2]) / 2
-        sigma = np.sqrt((num_cameras * own**2 + PRIOR_CAMERAS * USUAL_ERROR**2) / (num_cameras + PRIOR_CAMERAS))
+        sigma = np.sqrt((num_cameras * own**2 + PRIOR_CAMERAS * PRIOR_SIGMA**2) / (num_cameras + PRIOR_CAMERAS))
         num_near = max(int(np.searchsorted(rising, 3 * sigma, side="right")), 1)
     return float(sigma)
 
@@ -331,16 +330,16 @@ def _radius(centred: FloatArray, weights: FloatArray) -> float:
 
 
 def _check_spread(pairs: _Cameras, fit: Sim3, terms: _Terms) -> None:
-    """Refuse centres that stand still within their noise."""
+    """Refuse centres whose spread is within their noise."""
     share = terms.centre_weights / terms.centre_weights.sum()
     spread = min(
         float(fit.scale) * _radius(pairs.centres_a - share @ pairs.centres_a, share),
         _radius(pairs.centres_b - share @ pairs.centres_b, share),
     )
-    if not spread >= MIN_SPREAD * terms.centre_sigma:
+    if not spread >= MIN_SPREAD_SIGMAS * terms.centre_sigma:
         raise DegenerateAlignmentError(
             f"the centres spread by {spread:.2g} of the scene's depth and are uncertain by {terms.centre_sigma:.2g}; "
-            f"needed {MIN_SPREAD:g} times that: a camera that stands still leaves the scale free"
+            f"needed {MIN_SPREAD_SIGMAS:g} times that: a camera that stands still leaves the scale free"
         )
 
 

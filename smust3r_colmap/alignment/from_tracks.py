@@ -1,7 +1,7 @@
 """Aligning two submodels by feature tracks: points that both saw as the same feature of the same image.
 
-`align_tracks` needs shared images. `align_matches` is the bridge between submodels that share none, or
-too few: a verified two-view match says that a feature here and a feature there are one point.
+`align_tracks` needs shared images. `align_matches` joins submodels that share none, or too few, by
+verified two-view matches.
 The solver is behind ``seen_points``; ``from_pointmaps`` does the same for dense maps.
 """
 
@@ -16,8 +16,8 @@ from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.products import Submodel, Tracks
 
-MAX_VOTES = 5
-"""Shared observations of a point pair that count: more of them make the pairing no surer."""
+MAX_SHARED_OBSERVATIONS = 5
+"""Shared observations of a point pair that add to its weight."""
 MAX_MATCH_RELATIVE_ERROR = 0.25
 """Residual over depth at the robust start beyond which a match counts as wrong: five times the agreement
 that the start asks for. Most matches between submodels may be wrong."""
@@ -67,7 +67,7 @@ def align_matches(
     """Robust ``target_from_source`` from two-view matches between images of the two submodels.
 
     A match pairs the target's point behind (image_a, feature_a) to the source's point behind
-    (image_b, feature_b); matches with a feature that is part of no point are passed over. With the
+    (image_b, feature_b); matches with a feature of no point are ignored. With the
     redescending kernels matches further than a quarter of their depth from the robust start are left
     out; they still count in ``num_correspondences`` and ``relative_residual``.
 
@@ -110,8 +110,8 @@ def _align_point_pairs(
     max_start_error: float,
     seed: int,
 ) -> SubmodelFit:
-    """The fit to pairs of points named once for each vote they have."""
-    pairs, votes = np.unique(np.column_stack([point_target, point_source]), axis=0, return_counts=True)
+    """The fit to pairs of points, each repeated once per shared observation."""
+    pairs, counts = np.unique(np.column_stack([point_target, point_source]), axis=0, return_counts=True)
     depth_target, depth_source = point_depths(target)[pairs[:, 0]], point_depths(source)[pairs[:, 1]]
     points_target, points_source = _tracks(target).points_seg[pairs[:, 0]], _tracks(source).points_seg[pairs[:, 1]]
     usable = np.isfinite(np.column_stack([depth_target, depth_source, points_target, points_source])).all(axis=1)
@@ -119,7 +119,7 @@ def _align_point_pairs(
         return align_seen_points(
             points_source[usable],
             points_target[usable],
-            np.minimum(votes, MAX_VOTES)[usable].astype(np.float64),
+            np.minimum(counts, MAX_SHARED_OBSERVATIONS)[usable].astype(np.float64),
             depth_source=depth_source[usable],
             depth_target=depth_target[usable],
             kernel=settings.robust_kernel,
@@ -135,7 +135,7 @@ def _align_point_pairs(
 def point_depths(submodel: Submodel) -> FloatArray:
     """(P,) geometric mean over its observations of each track point's z-depth, in segment units.
 
-    Observations with the point behind the camera are passed over; NaN where none is left.
+    Observations with the point behind the camera are ignored; NaN where none is left.
 
     Raises:
         ValueError: the submodel has no tracks, or they name an image that is not of the submodel.

@@ -1,9 +1,9 @@
-"""Every edge between the submodels of a run, and the tests that keep broken ones out of the chain.
+"""Every edge between the submodels of a run, and the tests that reject wrong ones.
 
 Two submodels that share images are joined twice (paper section III-E): by the points that both saw,
-as feature tracks (as exact as dense pixels at a twentieth of the cost) or else as pointmaps, and by
+as feature tracks (as accurate as dense pixels at a twentieth of the cost) or else as pointmaps, and by
 the cameras of the shared images. Submodels that share too few images are joined by verified matches
-between their images. The next module to read is ``chaining``.
+between their images. The next module to read is ``stitching.spanning_tree``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from smust3r_colmap.alignment.from_pointmaps import align_pointmaps
 from smust3r_colmap.alignment.from_poses import align_poses
 from smust3r_colmap.alignment.from_tracks import align_matches, align_tracks, point_depths
 from smust3r_colmap.alignment.seen_points import SubmodelFit
-from smust3r_colmap.alignment.uncertainty import honest_information, overlap_centre
+from smust3r_colmap.alignment.uncertainty import inflated_information, overlap_centre
 from smust3r_colmap.config import AlignmentConfig
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.estimators.robust import evenly_chosen
@@ -44,7 +44,7 @@ MAX_RELATIVE_RESIDUAL = 0.05
 """Median residual over depth; sound edges have 0.0003 to 0.046, broken ones 0.15 to 0.76
 (measured on six real sets)."""
 MIN_SHARED_TRACKS = 30
-"""Fewer common points than COLMAP wants for one image do not carry a segment."""
+"""Common points; COLMAP asks for 30 to register a single image."""
 MIN_MATCH_INLIERS = 12
 """Inliers of an edge that rests on matches between images; a Sim(3) needs 3."""
 MIN_MATCH_INLIER_RATIO = 0.3
@@ -53,8 +53,8 @@ MIN_POSE_INLIER_RATIO = 0.3
 """Inliers over shared cameras, by centre and orientation; a broken pair had 3 of 14."""
 MAX_DISAGREEMENT_SIGMAS = 5.0
 """Between the edge from points and the one from cameras, per degree of freedom."""
-DEPTH_IMAGES = 8
-"""Maps looked at for the median depth of a submodel."""
+MEDIAN_DEPTH_IMAGES = 8
+"""Maps read for the median depth of a submodel."""
 MAX_CAMERA_TURN_DEG = 10.0
 """Median difference in rotation of the shared cameras after the fit; sound edges have 0.1 to 1.8."""
 
@@ -72,8 +72,8 @@ def align_submodels(
     """Align every pair of submodels that could have something in common.
 
     A pair gives up to two edges (paper section III-E): one from the points that both see, one from
-    the cameras of the images that both hold. Where both are sound but deny each other, the one from
-    points stays, since it rests on more.
+    the cameras of the images that both hold. Where both are sound but inconsistent, the one from points is
+    accepted, since it rests on more data.
 
     Args:
         submodels: all of the run. dense: their maps, in the same order.
@@ -147,7 +147,7 @@ class _Aligner:
                 fit = align_tracks(a, b, self.settings, seed=self.seed)
             else:
                 fit = align_pointmaps(a, b, self.dense[target], self.dense[source], self.settings, seed=self.seed)
-            return self._edge(target, source, fit, evidence, _refusal(a, b, fit))
+            return self._edge(target, source, fit, evidence, _rejection(a, b, fit))
         except DegenerateAlignmentError as error:
             return TriedAlignment(target=target, source=source, evidence=evidence, reason=str(error))
 
@@ -162,7 +162,7 @@ class _Aligner:
             fit = _align_by_matches(a, b, self.matches, self.settings, self.seed)
         except DegenerateAlignmentError as error:
             return TriedAlignment(target=target, source=source, evidence="matches", reason=str(error))
-        return self._edge(target, source, fit, "matches", _refusal_of_matches(a, b, fit))
+        return self._edge(target, source, fit, "matches", _rejection_of_matches(a, b, fit))
 
     def _by_poses(
         self, target: int, source: int, *, beside: Sequence[SegmentAlignment | TriedAlignment]
@@ -171,17 +171,17 @@ class _Aligner:
         group: Literal["sim3", "se3"] = "se3" if self.settings.transform_group == "se3" else "sim3"
         try:
             fit = align_poses(a, b, depth_target=self._depth(target), kernel=self.settings.robust_kernel, group=group)
-            edge = self._edge(target, source, fit, "poses", _refusal_of_poses(a, b, fit))
+            edge = self._edge(target, source, fit, "poses", _rejection_of_poses(a, b, fit))
         except DegenerateAlignmentError as error:
             return TriedAlignment(target=target, source=source, evidence="poses", reason=str(error))
-        return replace(edge, accepted=False, reason=reason) if (reason := _denied_by(edge, beside)) else edge
+        return replace(edge, accepted=False, reason=reason) if (reason := _inconsistency(edge, beside)) else edge
 
     def _edge(self, target: int, source: int, fit: SubmodelFit, evidence: str, reason: str) -> SegmentAlignment:
-        """The fit with the uncertainty that a graph may believe, in the group of the run."""
+        """The fit with inflated covariance, in the group of the run."""
         b = self.submodels[source]
         shared = set(self.submodels[target].images) & set(b.images)
         group = GROUPS[self.settings.transform_group]
-        information = honest_information(
+        information = inflated_information(
             fit.estimate,
             num_images=max(len(shared), 1),
             centre_source=overlap_centre(b, shared or set(b.images), self._depth(source)),
@@ -232,7 +232,7 @@ def median_depth(submodel: Submodel, maps: DenseMaps | None) -> float:
     elif maps is None:
         raise ValueError(f"submodel {submodel.name} has neither tracks nor maps")
     else:
-        some = evenly_chosen(len(submodel.images), DEPTH_IMAGES)
+        some = evenly_chosen(len(submodel.images), MEDIAN_DEPTH_IMAGES)
         depths = np.concatenate([maps.depth(int(k))[::4, ::4].ravel() for k in some]).astype(np.float64)
     known = depths[np.isfinite(depths) & (depths > 0)]
     if not len(known):
@@ -273,16 +273,16 @@ def _align_by_matches(
     )
 
 
-def _refusal(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
-    """Why an edge from shared images cannot be believed, or nothing."""
+def _rejection(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
+    """Why an edge from shared images is rejected, or empty."""
     if not fit.relative_residual <= MAX_RELATIVE_RESIDUAL:
         return f"median residual is {fit.relative_residual:.3f} of the depth, at most {MAX_RELATIVE_RESIDUAL}"
     if fit.num_correspondences < MIN_SHARED_TRACKS:
         return f"{fit.num_correspondences} common points, needed {MIN_SHARED_TRACKS}"
-    return _camera_refusal(a, b, fit)
+    return _camera_rejection(a, b, fit)
 
 
-def _camera_refusal(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
+def _camera_rejection(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
     if not set(a.images) & set(b.images):
         return ""
     turn_deg = camera_turn_deg(a, b, fit)
@@ -291,35 +291,35 @@ def _camera_refusal(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
     return ""
 
 
-def _refusal_of_matches(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
-    """The same for an edge from matches; cameras that are shared all the same have to agree."""
+def _rejection_of_matches(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
+    """The same for an edge from matches; cameras that are shared as well have to agree."""
     if fit.estimate.num_inliers < MIN_MATCH_INLIERS:
         return f"{fit.estimate.num_inliers} matched points fit, needed {MIN_MATCH_INLIERS}"
     if fit.inlier_share < MIN_MATCH_INLIER_RATIO:
         return f"{fit.inlier_share:.0%} of the matched points fit, needed {MIN_MATCH_INLIER_RATIO:.0%}"
-    return _camera_refusal(a, b, fit)
+    return _camera_rejection(a, b, fit)
 
 
-def _refusal_of_poses(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
+def _rejection_of_poses(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
     """The same for an edge from cameras."""
     if not fit.relative_residual <= MAX_RELATIVE_RESIDUAL:
         return f"the centres differ by {fit.relative_residual:.3f} of the depth, at most {MAX_RELATIVE_RESIDUAL}"
     if fit.inlier_share < MIN_POSE_INLIER_RATIO:
         return f"{fit.inlier_share:.0%} of {fit.num_correspondences} cameras fit, needed {MIN_POSE_INLIER_RATIO:.0%}"
-    return _camera_refusal(a, b, fit)
+    return _camera_rejection(a, b, fit)
 
 
-def _denied_by(edge: SegmentAlignment, beside: Sequence[SegmentAlignment | TriedAlignment]) -> str:
-    """Why an edge from cameras falls before those from points, or nothing."""
+def _inconsistency(edge: SegmentAlignment, beside: Sequence[SegmentAlignment | TriedAlignment]) -> str:
+    """Why an edge from cameras is rejected in favour of those from points, or empty."""
     if not edge.accepted:
         return ""
     sound = [one for one in beside if isinstance(one, SegmentAlignment) and one.accepted]
     if not sound and any(isinstance(one, SegmentAlignment) for one in beside):
-        return "the points of the same images were refused"
+        return "the edge from points of the same images was rejected"
     for other in sound:
         distance = disagreement_sigmas(edge, other)
         if distance > MAX_DISAGREEMENT_SIGMAS:
-            return f"it denies the edge from {other.evidence}: {distance:.1f} standard deviations apart"
+            return f"inconsistent with the edge from {other.evidence} ({distance:.1f} sigma)"
     return ""
 
 

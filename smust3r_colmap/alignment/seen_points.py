@@ -26,13 +26,13 @@ from smust3r_colmap.products import TransformEstimate
 logger = logging.getLogger(__name__)
 
 
-CONSENSUS_ERROR = 0.05
+CONSENSUS_RELATIVE_ERROR = 0.05
 """Residual over depth that counts as agreement at the start: sound overlaps have medians up to 0.046,
 broken ones from 0.15 (six real image sets)."""
-MIN_THICKNESS = 5.0
+MIN_THICKNESS_SIGMAS = 5.0
 """Thickness of the points over the noise in its direction, both root mean squares, for more than Sim(3).
 A stretch along it is known to noise / (thickness sqrt(n)) from n independent points; neighbouring
-pixels err together, so n is the number of places rather than of pixels, and with 16 of them five times
+pixels have correlated errors, so n counts places rather than pixels, and with 16 of them five times
 the noise leaves 5 %, as much as the fit is asked to correct. A wall has 0.7: its thickness is its noise,
 and the residual has the noise of both sides."""
 PLANE_RATIO = 1e-4
@@ -89,7 +89,7 @@ class _SeenPoints:
         if group == "sl4":
             return estimate_sl4(
                 *arguments,
-                max_error=CONSENSUS_ERROR * (float(np.median(self.depth)) if self.kernel == "huber" else 1.0),
+                max_error=CONSENSUS_RELATIVE_ERROR * (float(np.median(self.depth)) if self.kernel == "huber" else 1.0),
                 seed=self.seed,
                 kernel=self.kernel,
                 huber_delta=self.huber_delta,
@@ -122,13 +122,13 @@ def align_seen_points(
     """Robust ``target_from_source`` of points that cameras saw at known depths.
 
     ``cauchy`` and ``tukey`` divide the residual by the depth, since the error of a point grows with
-    it, and start from a consensus: from the plain start they are lost from 40 % coherent wrong pairs
-    on. The depth is the geometric mean of both sides, for the depth of one side gives more weight to
-    points which that side has too near, and a bias to the scale. ``huber`` is the method of the
-    paper: plain residuals, plain start.
+    it, and start from a consensus: from the plain start they fail at 40 % coherent wrong pairs. The
+    depth is the geometric mean of both sides: the depth of one side would give more weight to points
+    that this side has too near, and bias the scale. ``huber`` is the method of the paper: plain
+    residuals, plain start.
 
     ``affine3`` and ``sl4`` fall back to Sim(3), with a warning, where the points lie too close to a
-    plane for their noise or the fit is absurd; ``SubmodelFit.fallback`` says which and by how much.
+    plane for their noise or the fit is implausible; ``SubmodelFit.fallback`` says which and by how much.
 
     Args:
         points_source, points_target: (N, 3); equal rows are the same scene point.
@@ -153,14 +153,14 @@ def align_seen_points(
     points = points_source[usable], points_target[usable]
     unit = np.median(depth_target[usable] / depth_source[usable])
     depth = np.sqrt(depth_target[usable] * depth_source[usable] * unit)
-    start, believed = None, weights[usable]
+    start, start_weights = None, weights[usable]
     if kernel != "huber":
-        start = consensus_sim3(*points, max_error=CONSENSUS_ERROR * float(np.median(depth)), seed=seed)
-        believed = believed * (point_distances(start, *points) <= max_start_error * depth)
+        start = consensus_sim3(*points, max_error=CONSENSUS_RELATIVE_ERROR * float(np.median(depth)), seed=seed)
+        start_weights = start_weights * (point_distances(start, *points) <= max_start_error * depth)
     seen = _SeenPoints(
         source=points[0],
         target=points[1],
-        weights=believed,
+        weights=start_weights,
         depth=depth,
         kernel=kernel,
         huber_delta=huber_delta,
@@ -188,7 +188,7 @@ def _estimate_or_fall_back(
         similar = seen.estimate("sim3", start)
         reason = _plane(seen, similar) or str(error)  # where it is a plane, that explains the error
     else:
-        reason = _plane(seen, estimate) or absurdity(estimate.b_from_a, seen.inliers(estimate)[0])
+        reason = _plane(seen, estimate) or implausibility(estimate.b_from_a, seen.inliers(estimate)[0])
         if not reason:
             return estimate, ""
         similar = seen.estimate("sim3", start)
@@ -196,9 +196,9 @@ def _estimate_or_fall_back(
     return similar, reason
 
 
-# ------------------------------------------------------------------- what not to believe
+# ---------------------------------------------------------------- degenerate and implausible fits
 def _plane(seen: _SeenPoints, estimate: TransformEstimate) -> str:
-    """Why the inliers do not determine more than a similarity, with the numbers, or nothing."""
+    """Why the inliers do not determine more than a similarity, with the numbers, or empty."""
     source, target, weights = seen.inliers(estimate)
     share = weights / weights.sum()
     centred = target - share @ target
@@ -206,16 +206,16 @@ def _plane(seen: _SeenPoints, estimate: TransformEstimate) -> str:
     thickness, length = np.sqrt(np.maximum(variances[[0, 2]], 0.0))
     residuals = target - estimate.b_from_a.apply(source)
     noise = float(np.sqrt(share @ (residuals @ axes[:, 0]) ** 2))
-    if thickness >= max(MIN_THICKNESS * noise, PLANE_RATIO * length):
+    if thickness >= max(MIN_THICKNESS_SIGMAS * noise, PLANE_RATIO * length):
         return ""
     return (
         f"the common points are {thickness:.3g} thick at a length of {length:.3g}, with a noise of {noise:.3g} "
-        f"across; needed {MIN_THICKNESS:.0f} times the noise and {PLANE_RATIO:.0e} of the length"
+        f"across; needed {MIN_THICKNESS_SIGMAS:.0f} times the noise and {PLANE_RATIO:.0e} of the length"
     )
 
 
-def absurdity(b_from_a: Transform, points_a: FloatArray) -> str:
-    """Why no backbone's distortion can be so, with the numbers, or nothing.
+def implausibility(b_from_a: Transform, points_a: FloatArray) -> str:
+    """Why the fit cannot be the distortion of a backbone, with the numbers, or empty.
 
     Args:
         b_from_a: whose group keeps the orientation of space.

@@ -1,10 +1,10 @@
-"""How sure an edge is, so that edges of every kind may stand in one pose graph.
+"""The covariance of an edge, comparable between all kinds of edges in one pose graph.
 
-A solver that takes its rows as independent is sure of itself beyond reason: ten thousand pixels of
-thirty images are one reconstruction's opinion, and a reconstruction bends. What the edge stands for
-in the graph is where the two *whole* submodels lie, not where they agree on the images they share.
-The information of a solver is therefore cut down to few observations per image, and what no number
-of observations removes is added. The next module to read is ``edges``.
+A solver that takes its rows as independent gives a covariance that is far too small: the residuals of
+ten thousand pixels of thirty images are strongly correlated, because each submodel is distorted as a
+whole. An edge of the graph is the relation of two *whole* submodels, not of the images they share.
+The information of a solver is therefore scaled down to few observations per image, and a constant
+covariance is added. The next module to read is ``pairwise``.
 
 Measured on 25 pairs of submodels with true cameras, every submodel fitted to the truth by itself, which gives
 the true relation of a pair. Median error at the middle of the overlap (as degrees, percent of scale,
@@ -20,8 +20,8 @@ percent of the depth), and its squared length in standard deviations over 7, whi
     =============  ==================  =================  ===================  ===============
 
 The two edges of one pair agree ten times better with each other than with the truth (median over the
-sets 0.03 to 0.2 degrees, 0.01 to 0.7 %, 0.01 to 0.6 %): they share the bend of the submodels. So they are
-no two witnesses: the pose graph (``stitching``) divides what they say by their number.
+sets 0.03 to 0.2 degrees, 0.01 to 0.7 %, 0.01 to 0.6 %), because they share the distortion of the submodels.
+They are not independent: the pose graph (``stitching``) divides their information by their number.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import Submodel, TransformEstimate
 
 OBSERVATIONS_PER_IMAGE = 0.1
-"""Independent observations that a shared image is worth, be it as 300 pixels or as one camera."""
-FLOOR = 0.005
-"""Standard deviation that no evidence brings down, in each direction of the tangent space seen from the
-middle of the overlap: radians, log scale, shear, and parts of the depth for a shift."""
-UNKNOWN = 0.05
+"""Independent observations per shared image, for 300 pixels as well as for one camera."""
+SIGMA_FLOOR = 0.005
+"""Smallest standard deviation in each direction of the tangent space at the middle of the overlap: radians,
+log scale, shear, and fractions of the depth for a translation."""
+SIGMA_UNMEASURED = 0.05
 """Standard deviation of a direction that the group of the estimate does not have (such as the shear
 between two submodels of which a similarity is known): submodels of one backbone do not differ by more."""
 
 
-def honest_information(
+def inflated_information(
     estimate: TransformEstimate,
     *,
     num_images: int,
@@ -50,10 +50,10 @@ def honest_information(
     depth_source: float,
     group: type[Transform] | None = None,
 ) -> FloatArray:
-    """Information of an edge that may be weighed against others.
+    """Information of an edge with inflated covariance.
 
     The solver's information is scaled to ``OBSERVATIONS_PER_IMAGE`` rows per shared image, and
-    ``FLOOR`` is added to its covariance. Both happen in a frame with its origin in the middle of the
+    ``SIGMA_FLOOR`` is added to its covariance. Both happen in a frame with its origin in the middle of the
     overlap: there rotation, scale and shift are errors of different kinds, while at the origin of the
     submodel, which may be far, a rotation is mostly a shift. The adjoint carries the result back.
 
@@ -64,7 +64,7 @@ def honest_information(
         centre_source: (3,) middle of the overlap in the source frame, such as ``overlap_centre``.
         depth_source: median depth of the scene there, in units of the source.
         group: of the pose graph, where the estimate's own is a smaller one; directions that the
-            smaller one lacks get the standard deviation ``UNKNOWN``.
+            smaller one lacks get the standard deviation ``SIGMA_UNMEASURED``.
 
     Returns:
         (DOF, DOF) of ``group``, symmetric and positive semidefinite, of the right perturbation of
@@ -86,23 +86,23 @@ def honest_information(
             f"({wide.DOF} degrees of freedom)"
         )
     share = min(1.0, OBSERVATIONS_PER_IMAGE * num_images / estimate.num_points)
-    errors = _usual_errors(own, centre_source, depth_source)
-    whitened = np.eye(wide.DOF) * (FLOOR / UNKNOWN) ** 2
+    errors = _floor_errors(own, centre_source, depth_source)
+    whitened = np.eye(wide.DOF) * (SIGMA_FLOOR / SIGMA_UNMEASURED) ** 2
     whitened[: own.DOF, : own.DOF] = share * errors.T @ estimate.information @ errors
     # With the covariance of the floor as unit, information A joins it as (A^-1 + 1)^-1 = A (A + 1)^-1,
     # which needs no inverse of A.
     values, axes = np.linalg.eigh(whitened)
     values = np.maximum(values, 0.0)
-    back = axes.T @ np.linalg.inv(_usual_errors(wide, centre_source, depth_source))
+    back = axes.T @ np.linalg.inv(_floor_errors(wide, centre_source, depth_source))
     information: FloatArray = (back.T * (values / (values + 1.0))) @ back
     return information
 
 
 def overlap_centre(source: Submodel, shared: set[int], depth_source: float) -> FloatArray:
-    """(3,) median place at the usual depth before the cameras of the shared images.
+    """(3,) median point at the median depth before the cameras of the shared images.
 
     Args:
-        source: the submodel in whose frame the place is wanted.
+        source: the submodel; the point is in its frame.
         shared: indices into the collection.
         depth_source: median depth of its scene.
 
@@ -116,8 +116,8 @@ def overlap_centre(source: Submodel, shared: set[int], depth_source: float) -> F
     return centre
 
 
-def _usual_errors(group: type[Transform], centre: FloatArray, depth: float) -> FloatArray:
-    """(DOF, DOF) tangent vectors at the origin, as columns, of errors of size `FLOOR` about ``centre``.
+def _floor_errors(group: type[Transform], centre: FloatArray, depth: float) -> FloatArray:
+    """(DOF, DOF) tangent vectors at the origin, as columns, of errors of size `SIGMA_FLOOR` about ``centre``.
 
     The groups are nested, and so are these columns: the first 6 move rigidly, the 7th scales, 5 shear,
     and 3 are projective.
@@ -125,7 +125,7 @@ def _usual_errors(group: type[Transform], centre: FloatArray, depth: float) -> F
     place = np.eye(4)
     place[:3, 3] = centre
     errors: FloatArray = group.from_matrix(place).adjoint() @ group.vee(_generators(depth)[: group.DOF]).T
-    return FLOOR * errors
+    return SIGMA_FLOOR * errors
 
 
 def _generators(depth: float) -> FloatArray:

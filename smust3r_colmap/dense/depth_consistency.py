@@ -1,7 +1,7 @@
 """Depth maps of a run made to fit an adjusted model: in its undistorted views, its unit, and only where views agree.
 
 A backbone's maps cover the distorted originals and are in the unit of the stitched world. Bundle adjustment
-has moved that world a little, here more and there less. So every map is carried into the undistorted view,
+has moved that world a little, here more and there less. So every map is warped into the undistorted view,
 multiplied by the factor that puts it on the sparse points which its image observes, and compared with the
 maps of images that see the same points; depth that none of them confirms is dropped.
 The next modules to read are ``exporters.dense_workspace`` and ``exporters.trainer_folder``.
@@ -36,19 +36,19 @@ AnyFloats = npt.NDArray[np.floating[Any]]
 DEPTH_EDGE = 0.03
 """Neighbouring pixels of a map whose depths differ by more than this part are taken for two surfaces: between
 them nothing is blended. A wall seen at 80 degrees from its normal changes by less than that per pixel."""
-MIN_POINTS = 12
+MIN_SCALE_POINTS = 12
 """Sparse points on an image's map from which on it has a scale of its own; the median of fewer is luck."""
-LARGEST_SCALE_CHANGE = 1.5
-"""An image whose factor differs from the model's by more is not believed: adjusting moves cameras by percents."""
+MAX_SCALE_RATIO = 1.5
+"""An image whose factor differs from the model's by more is rejected: the adjustment moves cameras by percents."""
 CHECK_NEIGHBOURS = 8
 """Views that may confirm a depth."""
-CONFIRMATIONS = 2
+MIN_CONFIRMATIONS = 2
 """Views that must confirm it, or all where there are fewer. On an indoor sequence with a depth sensor, pixels
 within 5 % of it were 80 % without the test (75 % of the sensor's pixels covered), 85 % of those that one view
 confirms (66 %), and 88 % of those that two confirm (57 %)."""
 AGREEMENT = 0.02
 """Relative difference of depth within which a view confirms; twice the usual error of a swept depth."""
-BEST_PARALLAX_DEG = 5.0
+FULL_PARALLAX_DEG = 5.0
 """Median angle at the shared points from which on neighbours count in full; views from nearly the same place
 have the same errors and confirm anything."""
 CANDIDATES_PER_NEIGHBOUR = 3
@@ -56,8 +56,8 @@ CANDIDATES_PER_NEIGHBOUR = 3
 CACHE_BYTES = 256 << 20
 """Carried maps kept in memory, with what they are looked up by: two hundred of the usual size, and never fewer than
 two."""
-LARGEST_TURN = 0.5
-"""Cosine between viewing directions from which on two cameras without common points may see the same."""
+MIN_VIEW_COSINE = 0.5
+"""Cosine between viewing directions above which two cameras without common points may see the same surface."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -92,38 +92,38 @@ def depth_of_model(
         original: the adjusted model, with the cameras of the original images.
         undistorted: the same images by id with pinhole cameras; their sizes are those of the result.
         maps: by the names in ``original``; each covers its whole original image.
-        consistent: set to 0 what fewer than ``CONFIRMATIONS`` of the ``CHECK_NEIGHBOURS`` views that share
+        consistent: set to 0 what fewer than ``MIN_CONFIRMATIONS`` of the ``CHECK_NEIGHBOURS`` views that share
             most points found within ``AGREEMENT``.
 
     Raises:
         InputError: an undistorted image is not in the original model, or its camera is no pinhole.
     """
     names = _names_with_maps(original, undistorted, maps)
-    sightings = _Sightings.of(original, names)
-    scales = _scales(original, names, sightings, maps)
+    observations = _Observations.of(original, names)
+    scales = _scales(original, names, observations, maps)
     views = {i: _View.of(undistorted, i) for i in names}
-    carried = _carried_maps(original, undistorted, maps, scales)
-    neighbours = _neighbours(sightings, views) if consistent else None
-    return _iterate(names, scales, views, carried, neighbours)
+    warped = _warped_maps(original, undistorted, maps, scales)
+    neighbours = _neighbours(observations, views) if consistent else None
+    return _iterate(names, scales, views, warped, neighbours)
 
 
 def depth_scales(model: pycolmap.Reconstruction, maps: DepthMaps) -> dict[int, float]:
     """By image id, what the depth map of each image of the model must be multiplied with to fit its points."""
     names = {i: model.image(i).name for i in sorted(model.reg_image_ids()) if model.image(i).name in maps}
-    return {i: scale.factor for i, scale in _scales(model, names, _Sightings.of(model, names), maps).items()}
+    return {i: scale.factor for i, scale in _scales(model, names, _Observations.of(model, names), maps).items()}
 
 
 def _iterate(
     names: Mapping[int, str],
     scales: Mapping[int, _Scale],
     views: Mapping[int, _View],
-    carried: Callable[[int], _DepthLookup],
+    warped: Callable[[int], _DepthLookup],
     neighbours: Mapping[int, Sequence[int]] | None,
 ) -> Iterator[ModelDepth]:
     for i, name in names.items():
-        depth = carried(i).depth
+        depth = warped(i).depth
         if neighbours is not None:
-            depth = _confirmed(depth, views[i], [(views[j], carried(j)) for j in neighbours[i]])
+            depth = _confirmed(depth, views[i], [(views[j], warped(j)) for j in neighbours[i]])
         yield ModelDepth(name=name, depth=depth, scale=scales[i].factor, num_points=scales[i].num_points)
 
 
@@ -231,7 +231,7 @@ def _evident_depth(maps: DepthMaps, name: str) -> FloatMap:
     return evident
 
 
-def _carried_maps(
+def _warped_maps(
     original: pycolmap.Reconstruction,
     undistorted: pycolmap.Reconstruction,
     maps: DepthMaps,
@@ -247,23 +247,23 @@ def _carried_maps(
         xy = Intrinsics.from_colmap(distorted).xy_img(rays)
         return xy / (distorted.width, distorted.height)
 
-    def carry(i: int) -> _DepthLookup:
+    def warp(i: int) -> _DepthLookup:
         pinhole = undistorted.camera(undistorted.image(i).camera_id)
         depth = _evident_depth(maps, original.image(i).name)
         columns, rows = (places(original.image(i).camera_id, pinhole.camera_id) * depth.shape[::-1]).T
         sampled: FloatMap = sample_depth(depth, columns, rows) * np.float32(scales[i].factor)
         return _DepthLookup.of(sampled.reshape(pinhole.height, pinhole.width))
 
-    return _with_bounded_memory(carry)
+    return _with_bounded_memory(warp)
 
 
-def _with_bounded_memory(carry: Callable[[int], _DepthLookup]) -> Callable[[int], _DepthLookup]:
+def _with_bounded_memory(warp: Callable[[int], _DepthLookup]) -> Callable[[int], _DepthLookup]:
     """The same function, which remembers the last results up to ``CACHE_BYTES``."""
     cache: OrderedDict[int, _DepthLookup] = OrderedDict()
 
     def remembered(i: int) -> _DepthLookup:
         if i not in cache:
-            cache[i] = carry(i)
+            cache[i] = warp(i)
             while len(cache) > 2 and sum(lookup.nbytes for lookup in cache.values()) > CACHE_BYTES:
                 cache.popitem(last=False)
         cache.move_to_end(i)
@@ -274,7 +274,7 @@ def _with_bounded_memory(carry: Callable[[int], _DepthLookup]) -> Callable[[int]
 
 # ------------------------------------------------------------------------------- scale
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Sightings:
+class _Observations:
     """Which sparse points the images observe, and where.
 
     Args:
@@ -288,7 +288,7 @@ class _Sightings:
     xy: dict[int, FloatArray]
 
     @classmethod
-    def of(cls, model: pycolmap.Reconstruction, images: Mapping[int, str]) -> _Sightings:
+    def of(cls, model: pycolmap.Reconstruction, images: Mapping[int, str]) -> _Observations:
         row_of = {point_id: row for row, point_id in enumerate(model.points3D)}
         points, xy = {}, {}
         for i in images:
@@ -312,32 +312,32 @@ class _Scale:
 
 
 def _scales(
-    model: pycolmap.Reconstruction, images: Mapping[int, str], sightings: _Sightings, maps: DepthMaps
+    model: pycolmap.Reconstruction, images: Mapping[int, str], observations: _Observations, maps: DepthMaps
 ) -> dict[int, _Scale]:
     """One factor per image: the weighted median of z over map depth at the points it observes.
 
     A point counts by the length of its track. The factor of the whole model, the median of those of its images,
-    stands in for images with fewer than ``MIN_POINTS`` and for those beyond ``LARGEST_SCALE_CHANGE`` of it.
+    stands in for images with fewer than ``MIN_SCALE_POINTS`` and for those beyond ``MAX_SCALE_RATIO`` of it.
     """
     log_ratios, weights = {}, {}
     for i, name in images.items():
-        points = sightings.points[i]
+        points = observations.points[i]
         depth = _evident_depth(maps, name)
         camera = model.camera(model.image(i).camera_id)
-        columns, rows = (sightings.xy[i] / (camera.width, camera.height) * depth.shape[::-1]).T
+        columns, rows = (observations.xy[i] / (camera.width, camera.height) * depth.shape[::-1]).T
         on_map = sample_depth(depth, columns, rows)
         cam_from_world = model.image(i).cam_from_world().matrix()
-        z = sightings.xyz[points] @ cam_from_world[2, :3] + cam_from_world[2, 3]
+        z = observations.xyz[points] @ cam_from_world[2, :3] + cam_from_world[2, 3]
         usable = (on_map > 0) & (z > 0)
         log_ratios[i] = np.log(z[usable] / on_map[usable])
-        weights[i] = sightings.track_lengths[points[usable]]
-    own = {i: weighted_median(log_ratios[i], weights[i]) for i in images if len(log_ratios[i]) >= MIN_POINTS}
+        weights[i] = observations.track_lengths[points[usable]]
+    own = {i: weighted_median(log_ratios[i], weights[i]) for i in images if len(log_ratios[i]) >= MIN_SCALE_POINTS}
     everywhere = _log_scale_of_model(own, log_ratios)
     scales = {}
     for i in images:
-        believed = i in own and abs(own[i] - everywhere) <= np.log(LARGEST_SCALE_CHANGE)
+        accepted = i in own and abs(own[i] - everywhere) <= np.log(MAX_SCALE_RATIO)
         scales[i] = _Scale(
-            factor=float(np.exp(own[i] if believed else everywhere)), num_points=len(log_ratios[i]) if believed else 0
+            factor=float(np.exp(own[i] if accepted else everywhere)), num_points=len(log_ratios[i]) if accepted else 0
         )
     num_borrowed = sum(scale.num_points == 0 for scale in scales.values())
     if num_borrowed:
@@ -397,7 +397,7 @@ def _confirmed(depth: FloatMap, view: _View, others: Sequence[tuple[_View, _Dept
     rows, columns = np.divmod(unsure, depth.shape[1])
     xy1 = np.stack([columns + 0.5, rows + 0.5, np.ones(len(unsure))]).astype(np.float32)
     z = depth.ravel()[unsure]
-    missing = np.full(len(unsure), min(CONFIRMATIONS, len(others)), np.int8)
+    missing = np.full(len(unsure), min(MIN_CONFIRMATIONS, len(others)), np.int8)
     for other_view, other in others:
         matrix, offset = (array.astype(np.float32) for array in view.transfer_to(other_view))
         x, y, z_other = z * (matrix @ xy1) + offset[:, None]
@@ -411,13 +411,13 @@ def _confirmed(depth: FloatMap, view: _View, others: Sequence[tuple[_View, _Dept
     return kept
 
 
-def _neighbours(sightings: _Sightings, views: Mapping[int, _View]) -> dict[int, list[int]]:
+def _neighbours(observations: _Observations, views: Mapping[int, _View]) -> dict[int, list[int]]:
     """By image id, at most ``CHECK_NEIGHBOURS`` others with most points in common, seen from elsewhere.
 
     Images that share points with fewer take the nearest cameras that look the same way as well.
     """
     ids = list(views)
-    shared = _shared_points(sightings, ids)
+    shared = _shared_points(observations, ids)
     centres = np.array([views[i].centre for i in ids]).reshape(-1, 3)
     forward = np.array([views[i].cam_from_world[2, :3] for i in ids]).reshape(-1, 3)
     chosen = {}
@@ -426,38 +426,38 @@ def _neighbours(sightings: _Sightings, views: Mapping[int, _View]) -> dict[int, 
         counts[k] = 0
         ranked = np.argsort(-counts, kind="stable")[: CANDIDATES_PER_NEIGHBOUR * CHECK_NEIGHBOURS]
         candidates = ranked[counts[ranked] > 0]
-        scores = counts[candidates] * _parallax_weights(sightings, ids, centres, k, candidates)
+        scores = counts[candidates] * _parallax_weights(observations, ids, centres, k, candidates)
         best = list(candidates[np.argsort(-scores, kind="stable")[:CHECK_NEIGHBOURS]])
         if len(best) < CHECK_NEIGHBOURS:
             distance = np.linalg.norm(centres - centres[k], axis=1)
-            nearby = [j for j in np.argsort(distance, kind="stable") if forward[j] @ forward[k] >= LARGEST_TURN]
+            nearby = [j for j in np.argsort(distance, kind="stable") if forward[j] @ forward[k] >= MIN_VIEW_COSINE]
             best += [j for j in nearby if j != k and j not in best][: CHECK_NEIGHBOURS - len(best)]
         chosen[i] = [ids[j] for j in best]
     return chosen
 
 
-def _shared_points(sightings: _Sightings, ids: Sequence[int]) -> sparse.csr_matrix:
+def _shared_points(observations: _Observations, ids: Sequence[int]) -> sparse.csr_matrix:
     """(N, N) number of sparse points that two images both observe."""
-    rows = np.concatenate([np.full(len(sightings.points[i]), k) for k, i in enumerate(ids)] or [np.empty(0, int)])
-    columns = np.concatenate([sightings.points[i] for i in ids] or [np.empty(0, int)])
-    shape = (len(ids), max(len(sightings.xyz), 1))
+    rows = np.concatenate([np.full(len(observations.points[i]), k) for k, i in enumerate(ids)] or [np.empty(0, int)])
+    columns = np.concatenate([observations.points[i] for i in ids] or [np.empty(0, int)])
+    shape = (len(ids), max(len(observations.xyz), 1))
     observes = sparse.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=shape)
     return sparse.csr_matrix(observes @ observes.T)
 
 
 def _parallax_weights(
-    sightings: _Sightings, ids: Sequence[int], centres: FloatArray, k: int, candidates: npt.NDArray[np.intp]
+    observations: _Observations, ids: Sequence[int], centres: FloatArray, k: int, candidates: npt.NDArray[np.intp]
 ) -> FloatArray:
     """(C,) from 0 to 1 by the median angle between the rays from two centres to the points that both see."""
-    seen_here = np.zeros(len(sightings.xyz), np.bool_)
-    seen_here[sightings.points[ids[k]]] = True
+    seen_here = np.zeros(len(observations.xyz), np.bool_)
+    seen_here[observations.points[ids[k]]] = True
     weights = np.empty(len(candidates))
     for row, j in enumerate(candidates):
-        points = sightings.points[ids[j]]
-        xyz = sightings.xyz[points[seen_here[points]]]
+        points = observations.points[ids[j]]
+        xyz = observations.xyz[points[seen_here[points]]]
         to_here, to_there = centres[k] - xyz, centres[j] - xyz
         lengths = np.linalg.norm(to_here, axis=1) * np.linalg.norm(to_there, axis=1)
         cosines = np.einsum("ni,ni->n", to_here, to_there) / np.maximum(lengths, np.finfo(np.float64).tiny)
         angle_deg = np.degrees(np.arccos(np.clip(np.median(cosines), -1, 1)))
-        weights[row] = min(angle_deg / BEST_PARALLAX_DEG, 1.0)
+        weights[row] = min(angle_deg / FULL_PARALLAX_DEG, 1.0)
     return weights

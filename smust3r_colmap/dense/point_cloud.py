@@ -1,11 +1,7 @@
-"""From placed submodels to one scene: every image one pose, every camera one calibration, one cloud.
+"""One point cloud from the dense maps of all images, averaged over voxels.
 
-Submodels overlap, so most images were reconstructed twice. Their poses are averaged, calibrations are
-voted on, and of the dense maps one per image is used, hung on the averaged pose so that cloud and
-cameras agree. Submodels of loop segments only speak for images that no window submodel holds: they are made
-of two short runs of the sequence, and their work is done in the graph.
-All of it takes values and returns values; maps are read one image at a time.
-The next modules to read are the exporters.
+Submodels overlap, so most images have several maps; one per image is used, at the fused pose, so that
+cloud and cameras agree. Maps are read one image at a time. The next modules to read are the exporters.
 """
 
 from __future__ import annotations
@@ -24,10 +20,10 @@ from smust3r_colmap.stitching.resection import PlacedSubmodel
 
 SAMPLES_PER_POINT = 4
 """Pixels gathered per fused point: enough for every voxel to be an average, few enough for memory."""
-FULL_ENOUGH = 0.9
-"""The search for the voxel size stops between this part of ``max_points`` and all of it."""
-ENOUGH_SEEN_TWICE = 0.5
-"""Voxels seen by one image only are dropped where at least this part of the cloud stays."""
+MIN_FILL_RATIO = 0.9
+"""The search for the voxel size ends with at least this fraction of ``max_points``."""
+MIN_MULTIVIEW_RATIO = 0.5
+"""Voxels seen by one image only are dropped where at least this fraction of the cloud remains."""
 DEPTH_JUMP = 0.1
 """Neighbours whose depths differ by more than this part belong to two surfaces and give no normal."""
 NO_NORMAL_WEIGHT = 1e-3
@@ -36,16 +32,9 @@ NO_NORMAL_WEIGHT = 1e-3
 _CELL_BITS = 21  # three axes of 21 bits fill an int64 without its sign
 
 
-# ---------------------------------------------------------------------------- cameras
-
-
-# ------------------------------------------------------------------------- intrinsics
-
-
-# ----------------------------------------------------------------------------- points
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FusedPoints:
-    """The cloud of a connected part, with what became of the pixels.
+    """The cloud of a connected part, with counts of the pixels.
 
     Args:
         cloud: in the world frame, with normals.
@@ -96,7 +85,7 @@ class _MapSamples:
     points_cam: FloatArray  # (M, 3)
     normals_cam: FloatArray  # (M, 3)
     rgb: npt.NDArray[np.uint8]  # (M, 3)
-    spacing: float  # usual distance of neighbouring confident pixels, NaN where there are none
+    spacing: float  # median distance of neighbouring confident pixels, NaN where there are none
     num_pixels: int  # confident ones
 
     def in_world(self, image: int, world_from_cam: FloatArray, origin: FloatArray) -> _Samples:
@@ -127,7 +116,7 @@ def fuse_points(
     times scale along the rays of the submodel's own intrinsics (those made the depth, the fused ones did
     not); maps that carry more than depth keep it, and a transform that bends them bends the cloud.
 
-    Cells start at the usual distance of neighbouring pixels and grow until ``max_points`` suffice.
+    Cells start at the median distance of neighbouring pixels and grow until ``max_points`` suffice.
     Cells that one image only saw are dropped where at least half of the cloud stays. Normals come from
     neighbouring pixels, face the camera, and are averaged; where no pixel of a cell has one (rims,
     depth jumps) the normal points to the cameras. The result depends on nothing but the arguments.
@@ -254,7 +243,7 @@ def _gathered(
     quota: int,
     min_confidence: float,
 ) -> tuple[_Samples, float, int]:
-    """Samples of all images, the usual distance of neighbouring pixels, and the number of pixels."""
+    """Samples of all images, the median distance of neighbouring pixels, and the number of pixels."""
     parts, spacings, num_pixels = [], [], 0
     world_from_cam = invert_rigid(cameras.cam_from_world)
     each = zip(cameras.images, cameras.best_submodel, depth_scale, world_from_cam, strict=True)
@@ -294,7 +283,7 @@ def _num_occupied(xyz: npt.NDArray[np.float32], voxel_size: float) -> int:
 def _voxel_size(xyz: npt.NDArray[np.float32], finest: float, max_points: int) -> float:
     """The smallest size, not below ``finest``, at which at most ``max_points`` cells are occupied.
 
-    Found by growing, then halving the bracket, to within ``FULL_ENOUGH`` or 2 percent of the size.
+    Found by growing, then halving the bracket, to within ``MIN_FILL_RATIO`` or 2 percent of the size.
     """
     too_small, size = finest, finest
     count = _num_occupied(xyz, size)
@@ -302,7 +291,7 @@ def _voxel_size(xyz: npt.NDArray[np.float32], finest: float, max_points: int) ->
         too_small = size
         size *= 1.05 * np.sqrt(count / max_points)  # a surface occupies cells as size ** -2
         count = _num_occupied(xyz, size)
-    while count < FULL_ENOUGH * max_points and size > 1.02 * too_small:
+    while count < MIN_FILL_RATIO * max_points and size > 1.02 * too_small:
         middle = float(np.sqrt(too_small * size))
         count_middle = _num_occupied(xyz, middle)
         if count_middle > max_points:
@@ -319,7 +308,7 @@ def _averaged(samples: _Samples, cells: IntArray, origin: FloatArray) -> tuple[P
     ends = np.append(starts[1:], len(order))
     # Samples are ordered by image and the sort is stable, so first and last tell of a second image.
     seen_twice = samples.image[order[starts]] != samples.image[order[ends - 1]]
-    kept = seen_twice if seen_twice.mean() >= ENOUGH_SEEN_TWICE else np.ones_like(seen_twice)
+    kept = seen_twice if seen_twice.mean() >= MIN_MULTIVIEW_RATIO else np.ones_like(seen_twice)
 
     def sums(values: npt.NDArray[np.float32] | npt.NDArray[np.uint8]) -> FloatArray:
         columns = [np.add.reduceat(column[order].astype(np.float64), starts)[kept] for column in values.T]
@@ -335,6 +324,3 @@ def _averaged(samples: _Samples, cells: IntArray, origin: FloatArray) -> tuple[P
         normals=_unit(normals).astype(np.float32),
     )
     return cloud, int(np.count_nonzero(~kept))
-
-
-# ------------------------------------------------------------------------------ scene

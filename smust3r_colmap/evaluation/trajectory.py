@@ -132,9 +132,3 @@ def _largest_gap(estimated: Trajectory, reference: Trajectory) -> int:
     """The longest run of reference images, in order of name, without an estimate."""
     runs = groupby(sorted(reference), key=lambda name: name in estimated)
     return max((len(list(run)) for has_estimate, run in runs if not has_estimate), default=0)
-
-
-# -------------------------------------------------------------------------- alignment
-
-
-# ---------------------------------------------------------------------------- readers

@@ -1,13 +1,13 @@
 """Choosing loops among the images that look alike, and cutting their segments (paper section III-F).
 
-Every pair of segments with images that look alike is a candidate and gets a decision in words. Whether
-a chosen loop is true is not decided here: its segment must first be reconstructed and agree with both
-sides, and the pose graph may still reject it.
+Every pair of segments with images that look alike is a candidate and gets a decision with a reason. Whether
+a chosen loop is true is not decided here: its segment is reconstructed and verified first, and the pose
+graph may still reject it.
 
 How similar is similar enough:
 
 - A given similarity (the paper's sigma) is compared with the cosines of single images, as in the paper.
-- Automatic: images are compared together with their neighbours (``detection``), and the threshold is
+- Automatic: images are compared together with their neighbours (``similarity``), and the threshold is
   four robust standard deviations above the median of far pairs. Where the camera comes back often, or
   images are few, the loops themselves widen that scatter (a castle in 30 photographs: its one true loop
   stands at 2.7). So the best few loops may lie below the threshold, down to two standard deviations.
@@ -59,7 +59,7 @@ _SAMPLED_IN_BETWEEN = 256
 
 @dataclass(frozen=True, kw_only=True)
 class LoopCandidate:
-    """Two segments with images that look alike, and what became of them.
+    """Two segments with images that look alike, and the decision.
 
     Args:
         image_a, image_b: the most similar images of the two, ``image_a`` at home in ``segment_a``.
@@ -263,18 +263,18 @@ class _Rules:
 def _choose(
     pairs: Sequence[AlikeSegments], compared: Descriptors, windows: Sequence[Segment], rules: _Rules
 ) -> tuple[tuple[LoopCandidate, ...], tuple[PlannedLoop, ...]]:
-    """Go through the pairs, the best first, and take those that nothing speaks against."""
+    """Go through the pairs, the best first, and take those without a rejection reason."""
     candidates: list[LoopCandidate] = []
     loops: list[PlannedLoop] = []
     for pair in pairs:
         run_a = images_around(windows[pair.segment_a].images, pair.image_a, rules.half_width)
         run_b = images_around(windows[pair.segment_b].images, pair.image_b, rules.half_width)
-        objection = _objection_to_pair(pair, rules) or _objection_beside(pair, loops, rules)
-        if not objection and run_a[-1] + 1 >= run_b[0]:
-            objection = "the images around the two ends touch"
-        if not objection and not _left_in_between(pair, compared, rules):
-            objection = "the camera did not leave the place in between"
-        if not objection:
+        rejection = _pair_rejection(pair, rules) or _rejection_beside(pair, loops, rules)
+        if not rejection and run_a[-1] + 1 >= run_b[0]:
+            rejection = "the images around the two ends touch"
+        if not rejection and not _left_in_between(pair, compared, rules):
+            rejection = "the camera did not leave the place in between"
+        if not rejection:
             segment = Segment(index=len(windows) + len(loops), images=run_a + run_b, kind="loop")
             loops.append(
                 PlannedLoop(
@@ -286,18 +286,20 @@ def _choose(
                     similarity=pair.similarity,
                 )
             )
-        candidates.append(LoopCandidate(**asdict(pair), taken=not objection, reason=objection or _praise(pair, rules)))
+        candidates.append(
+            LoopCandidate(**asdict(pair), taken=not rejection, reason=rejection or _acceptance(pair, rules))
+        )
     return tuple(candidates), tuple(loops)
 
 
-def _praise(pair: AlikeSegments, rules: _Rules) -> str:
+def _acceptance(pair: AlikeSegments, rules: _Rules) -> str:
     if pair.similarity >= rules.threshold:
         return f"taken: at or above the threshold {rules.threshold:.3f}"
     return f"taken: one of the best {rules.weak_loops}, though below the threshold {rules.threshold:.3f}"
 
 
-def _objection_to_pair(pair: AlikeSegments, rules: _Rules) -> str:
-    """What the pair itself falls short of, or empty."""
+def _pair_rejection(pair: AlikeSegments, rules: _Rules) -> str:
+    """The rejection reason of the pair itself, or empty."""
     distance = pair.segment_b - pair.segment_a
     if distance < rules.min_distance:
         return f"too near in order: {distance} segments apart, needed {rules.min_distance}"
@@ -306,8 +308,8 @@ def _objection_to_pair(pair: AlikeSegments, rules: _Rules) -> str:
     return ""
 
 
-def _objection_beside(pair: AlikeSegments, loops: Sequence[PlannedLoop], rules: _Rules) -> str:
-    """Which of the better loops, already taken, stand against the pair, or empty."""
+def _rejection_beside(pair: AlikeSegments, loops: Sequence[PlannedLoop], rules: _Rules) -> str:
+    """The rejection reason beside the better loops that were taken, or empty."""
     for loop in loops:
         # A box in both directions of time: the second visit may run along the first or against it.
         if abs(loop.image_a - pair.image_a) <= rules.radius and abs(loop.image_b - pair.image_b) <= rules.radius:

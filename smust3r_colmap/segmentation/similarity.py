@@ -1,7 +1,7 @@
 """Which images look alike although they are far apart in the sequence (paper section III-F).
 
 Descriptors are unit vectors, one per image; their cosine is the similarity. The next module to read
-is ``planning``, which turns what is found here into loops.
+is ``loop_segments``, which plans loops from these pairs.
 
 Sequence matching. A place that was visited twice was seen by several images both times, so images
 are compared together with their neighbours: every descriptor is replaced by the mean of those around
@@ -92,7 +92,7 @@ class AlikeSegments:
 
 
 def check_descriptors(descriptors: npt.NDArray[np.float32], num_images: int) -> None:
-    """Refuse what would silently spoil every similarity.
+    """Refuse descriptors that would make every similarity meaningless.
 
     Raises:
         InputError: not (num_images, D), a value that is not finite, or a row neither zero nor of unit length.

@@ -17,12 +17,12 @@ from smust3r_colmap.geometry.so3 import angles_between, nearest_rotation
 from smust3r_colmap.products import DenseMaps, ImageCollection, PointCloud, Scene
 from smust3r_colmap.stitching.resection import PlacedSubmodel
 
-OUTLIER_RATIO = 5.0
-"""A pose is left out beyond this many times the usual disagreement of its two submodels. Drift that grows
-along an overlap reaches two to four times its own median, and is to be blended, not cut."""
-LONGEST_HOLE = 5
-"""Images missing in a row that do not end a run: a few blurred frames do not take an image's
-neighbours away, but the two sides of a loop are no neighbours."""
+MAX_DISAGREEMENT_RATIO = 5.0
+"""A pose is an outlier beyond this many times the median disagreement of its two submodels. Drift that
+grows along an overlap reaches two to four times its own median, and is averaged."""
+MAX_GAP_IMAGES = 5
+"""Missing images that do not end a run: after a few blurred frames the neighbours still overlap, but the
+two sides of a loop are not neighbours."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,8 +32,8 @@ class FusedCameras:
     Args:
         images: (N,) indices into the collection, ascending.
         cam_from_world: (N, 3, 4) rigid.
-        num_submodels: (N,) submodels that speak for the image: the windows that hold it, else the loop submodels.
-        num_dropped: (N,) of these, poses left out because they disagree with the rest.
+        num_submodels: (N,) submodels that support the image: the windows that hold it, else the loop submodels.
+        num_dropped: (N,) of these, poses rejected as outliers.
         best_submodel: (N,) position of the submodel, among those used, where the image lies most central.
         position_spread: (N,) largest distance between two submodels' centres of the image, as a part of
             ``scene_radius``; dropped poses count too; NaN where one submodel holds the image.
@@ -63,12 +63,12 @@ class FusedCameras:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Sightings:
-    """What the submodels say about one image; leading axis: the submodels that hold it."""
+class _ImagePoses:
+    """The poses of one image; leading axis: the submodels that support it."""
 
     submodels: tuple[int, ...]
     world_from_cam: FloatArray  # (K, 3, 4)
-    weights: FloatArray  # (K,) centrality
+    weights: FloatArray  # (K,) support weights
 
     def disagreement(self) -> tuple[FloatArray, FloatArray]:
         """(K, K) distances of the centres and (K, K) angles in degrees between the rotations."""
@@ -80,13 +80,13 @@ class _Sightings:
 def fuse_cameras(submodels: Sequence[PlacedSubmodel]) -> FusedCameras:
     """One pose per image: centres by weighted mean, rotations by weighted chordal mean.
 
-    The weight is the image's ``centrality`` in each submodel, so through an overlap the trajectory passes
-    steadily from one submodel to the next. Poses that disagree are treated in two ways. A disagreement as
-    large as usual between these two submodels is drift: it is blended. A pose farther than
-    ``OUTLIER_RATIO`` times that from the weighted medoid of its image is an accident of one submodel: it
-    is left out and counted. Of three poses the medoid is the majority, of two the more central one.
-    An accident is told from drift where two submodels share at least three images; two that disagree on
-    every image they share are blended all the same, and the spread tells.
+    The weights are the ``support_weights`` of each submodel, so through an overlap the trajectory passes
+    steadily from one submodel to the next. Poses that disagree are treated in two ways. A disagreement
+    near the median of these two submodels is drift, and the poses are averaged. A pose farther than
+    ``MAX_DISAGREEMENT_RATIO`` times that from the weighted medoid of its image is an outlier: it is
+    rejected and counted. Of three poses the medoid is the majority, of two the one of larger weight.
+    Outliers can be told from drift where two submodels share at least three images. Two submodels that
+    disagree on every shared image are averaged; ``position_spread`` shows it.
 
     Args:
         submodels: of one connected part, placed in its world.
@@ -98,28 +98,28 @@ def fuse_cameras(submodels: Sequence[PlacedSubmodel]) -> FusedCameras:
     """
     if not submodels:
         raise ValueError("fusion: no submodel, needed at least one")
-    sightings = _sightings_by_image(submodels)
-    centres = np.concatenate([sighting.world_from_cam[:, :, 3] for sighting in sightings.values()])
+    all_poses = _poses_by_image(submodels)
+    centres = np.concatenate([poses.world_from_cam[:, :, 3] for poses in all_poses.values()])
     radius = float(np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
-    usual = _usual_disagreement(sightings.values(), radius)
-    kept = [_agreeing(sighting, usual) for sighting in sightings.values()]
-    spread = [[matrix.max() for matrix in sighting.disagreement()] for sighting in sightings.values()]
-    alone = np.array([len(sighting.submodels) == 1 for sighting in sightings.values()])
+    median = _median_disagreement(all_poses.values(), radius)
+    kept = [_agreeing(poses, median) for poses in all_poses.values()]
+    spread = [[matrix.max() for matrix in poses.disagreement()] for poses in all_poses.values()]
+    alone = np.array([len(poses.submodels) == 1 for poses in all_poses.values()])
     distance, angle_deg = np.array(spread).T
     world_from_cam = np.stack(
         [
-            _mean_pose(sighting.world_from_cam[keep], sighting.weights[keep])
-            for sighting, keep in zip(sightings.values(), kept, strict=True)
+            _mean_pose(poses.world_from_cam[keep], poses.weights[keep])
+            for poses, keep in zip(all_poses.values(), kept, strict=True)
         ]
     )
     best_submodel = np.array(
         [
-            sighting.submodels[int(np.argmax(np.where(keep, sighting.weights, 0)))]
-            for sighting, keep in zip(sightings.values(), kept, strict=True)
+            poses.submodels[int(np.argmax(np.where(keep, poses.weights, 0)))]
+            for poses, keep in zip(all_poses.values(), kept, strict=True)
         ]
     )
     return FusedCameras(
-        images=tuple(sightings),
+        images=tuple(all_poses),
         cam_from_world=invert_rigid(world_from_cam),
         num_submodels=np.array([len(keep) for keep in kept]),
         num_dropped=np.array([np.count_nonzero(~keep) for keep in kept]),
@@ -129,31 +129,31 @@ def fuse_cameras(submodels: Sequence[PlacedSubmodel]) -> FusedCameras:
         residual_px=np.array(
             [
                 submodels[best].residual_px[submodels[best].submodel.images.index(image)]
-                for image, best in zip(sightings, best_submodel, strict=True)
+                for image, best in zip(all_poses, best_submodel, strict=True)
             ]
         ),
         scene_radius=radius,
     )
 
 
-def centrality(images: Sequence[int]) -> FloatArray:
+def support_weights(images: Sequence[int]) -> FloatArray:
     """(N,) weight of each image of a submodel, in (0, 1]: falls linearly from the middle of its run to the ends.
 
     An image in the middle of a run has neighbours on both sides, one at its end on one side only. A
-    run ends where more than ``LONGEST_HOLE`` images are missing.
+    run ends where more than ``MAX_GAP_IMAGES`` images are missing.
 
     Args:
         images: indices into the collection, ascending.
     """
-    ends = np.flatnonzero(np.diff(images) > LONGEST_HOLE + 1) + 1
+    ends = np.flatnonzero(np.diff(images) > MAX_GAP_IMAGES + 1) + 1
     runs = [np.arange(len(run)) for run in np.split(np.asarray(images), ends)]
     to_end = np.concatenate([np.minimum(run, run[::-1]) + 1 for run in runs])
     weights: FloatArray = to_end / to_end.max()
     return weights
 
 
-def speaking_images(submodels: Sequence[PlacedSubmodel]) -> list[npt.NDArray[np.bool_]]:
-    """Per submodel, (N,) for which of its images it counts: all of a window's, of a loop's those no window holds."""
+def supported_images(submodels: Sequence[PlacedSubmodel]) -> list[npt.NDArray[np.bool_]]:
+    """Per submodel, (N,) which of its images it supports: a window all, a loop those that no window holds."""
     in_windows = {image for placed in submodels if not placed.is_loop for image in placed.submodel.images}
     return [
         np.array([not (placed.is_loop and image in in_windows) for image in placed.submodel.images], dtype=np.bool_)
@@ -161,15 +161,15 @@ def speaking_images(submodels: Sequence[PlacedSubmodel]) -> list[npt.NDArray[np.
     ]
 
 
-def _sightings_by_image(submodels: Sequence[PlacedSubmodel]) -> dict[int, _Sightings]:
-    """Per image, ascending, what each submodel that speaks for it says."""
+def _poses_by_image(submodels: Sequence[PlacedSubmodel]) -> dict[int, _ImagePoses]:
+    """Per image, ascending, its pose in each submodel that supports it."""
     found: dict[int, list[tuple[int, FloatArray, float]]] = defaultdict(list)
-    for position, (placed, speaks) in enumerate(zip(submodels, speaking_images(submodels), strict=True)):
-        weights = centrality(placed.submodel.images)
-        for k in np.flatnonzero(speaks):
+    for position, (placed, supported) in enumerate(zip(submodels, supported_images(submodels), strict=True)):
+        weights = support_weights(placed.submodel.images)
+        for k in np.flatnonzero(supported):
             found[placed.submodel.images[k]].append((position, placed.world_from_cam[k], weights[k]))
     return {
-        image: _Sightings(
+        image: _ImagePoses(
             submodels=tuple(position for position, _, _ in found[image]),
             world_from_cam=np.stack([pose for _, pose, _ in found[image]]),
             weights=np.array([weight for _, _, weight in found[image]]),
@@ -178,33 +178,33 @@ def _sightings_by_image(submodels: Sequence[PlacedSubmodel]) -> dict[int, _Sight
     }
 
 
-def _usual_disagreement(sightings: Iterable[_Sightings], radius: float) -> dict[tuple[int, int], tuple[float, float]]:
+def _median_disagreement(all_poses: Iterable[_ImagePoses], radius: float) -> dict[tuple[int, int], tuple[float, float]]:
     """Per pair of submodels, the median distance and angle in degrees over the images they share.
 
     Never less than rounding: 1e-6 of the scene's radius and 1e-4 degrees.
     """
     found: dict[tuple[int, int], list[tuple[float, float]]] = defaultdict(list)
-    for sighting in sightings:
-        distances, angles_deg = sighting.disagreement()
-        for a, b in combinations(range(len(sighting.submodels)), 2):
-            found[sighting.submodels[a], sighting.submodels[b]].append((distances[a, b], angles_deg[a, b]))
-    usual = {}
+    for poses in all_poses:
+        distances, angles_deg = poses.disagreement()
+        for a, b in combinations(range(len(poses.submodels)), 2):
+            found[poses.submodels[a], poses.submodels[b]].append((distances[a, b], angles_deg[a, b]))
+    median = {}
     for pair, values in found.items():
         distance, angle_deg = np.median(values, axis=0)
-        usual[pair] = (max(float(distance), 1e-6 * radius), max(float(angle_deg), 1e-4))
-    return usual
+        median[pair] = (max(float(distance), 1e-6 * radius), max(float(angle_deg), 1e-4))
+    return median
 
 
-def _agreeing(sighting: _Sightings, usual: dict[tuple[int, int], tuple[float, float]]) -> npt.NDArray[np.bool_]:
-    """(K,) which poses lie near the weighted medoid, in units of the usual disagreement."""
-    distances, angles_deg = sighting.disagreement()
+def _agreeing(poses: _ImagePoses, median: dict[tuple[int, int], tuple[float, float]]) -> npt.NDArray[np.bool_]:
+    """(K,) which poses lie near the weighted medoid, in units of the median disagreement."""
+    distances, angles_deg = poses.disagreement()
     ratio = np.zeros_like(distances)
-    for a, b in combinations(range(len(sighting.submodels)), 2):
-        usual_distance, usual_angle_deg = usual[sighting.submodels[a], sighting.submodels[b]]
-        by_distance = distances[a, b] / usual_distance if usual_distance > 0 else 0.0
-        ratio[a, b] = ratio[b, a] = max(by_distance, angles_deg[a, b] / usual_angle_deg)
-    medoid = int(np.argmin(ratio @ sighting.weights))
-    agreeing: npt.NDArray[np.bool_] = ratio[medoid] <= OUTLIER_RATIO
+    for a, b in combinations(range(len(poses.submodels)), 2):
+        median_distance, median_angle_deg = median[poses.submodels[a], poses.submodels[b]]
+        by_distance = distances[a, b] / median_distance if median_distance > 0 else 0.0
+        ratio[a, b] = ratio[b, a] = max(by_distance, angles_deg[a, b] / median_angle_deg)
+    medoid = int(np.argmin(ratio @ poses.weights))
+    agreeing: npt.NDArray[np.bool_] = ratio[medoid] <= MAX_DISAGREEMENT_RATIO
     return agreeing
 
 
@@ -219,8 +219,8 @@ def _mean_pose(world_from_cam: FloatArray, weights: FloatArray) -> FloatArray:
 def fuse_intrinsics(submodels: Sequence[PlacedSubmodel], camera_of_image: Sequence[int]) -> dict[int, Intrinsics]:
     """One calibration per camera: the median of each parameter over all registered images.
 
-    A submodel counts as often as it speaks for an image of the camera (``speaking_images``). Where submodels
-    disagree about the camera model, the model of most images is taken and the others have no say.
+    A submodel counts once per supported image of the camera (``supported_images``). Where submodels
+    disagree about the camera model, the model of most images is taken and the others are ignored.
 
     Args:
         submodels: of one connected part, intrinsics at the original image size.
@@ -233,8 +233,8 @@ def fuse_intrinsics(submodels: Sequence[PlacedSubmodel], camera_of_image: Sequen
         ValueError: two submodels hold one camera at different image sizes.
     """
     found: dict[int, list[Intrinsics]] = defaultdict(list)
-    for placed, speaks in zip(submodels, speaking_images(submodels), strict=True):
-        for k in np.flatnonzero(speaks):
+    for placed, supported in zip(submodels, supported_images(submodels), strict=True):
+        for k in np.flatnonzero(supported):
             found[camera_of_image[placed.submodel.images[k]]].append(placed.submodel.intrinsics[k])
     return {camera: _median_intrinsics(camera, found[camera]) for camera in sorted(found)}
 

@@ -1,10 +1,10 @@
-"""The geometric proof that a loop has to give before it may bend anything.
+"""Geometric verification of loop closures.
 
-Two places that look alike need not be one. A planned loop is believed when its segment came out in
-one submodel that holds both ends, when that submodel fits the windows on both sides, and when the way
-through it ends where the chain of windows ends, as far as their uncertainties tell. What a chain too
-long to be sure of anything lets pass is left to the robust kernel of the pose graph.
-The next module to read is ``stitching``.
+Two places that look alike need not be one. A planned loop is accepted when its segment gave one submodel
+that holds both ends, when that submodel has a sound edge to a window of either end, and when the
+transform through the loop agrees with the chain of windows within their covariances. A long chain has
+a large covariance and rejects little; then the robust kernel of the pose graph decides.
+The next module to read is ``stitch``.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ MIN_END_IMAGES = 3
 """Images of each end that the loop submodel must hold and share with a window."""
 MAX_CLOSURE_SIGMAS = 5.0
 """Between the way through the loop and the chain, per degree of freedom. The covariances are good to a
-factor of two or three, so this refuses what is absurd and leaves the rest to the graph."""
-NOTHING_KNOWN = 1e-12
-"""Information, of rows of unit size, with which every direction is taken to be known at least."""
+factor of two or three, so this rejects gross errors and leaves the rest to the pose graph."""
+MIN_UNIT_INFORMATION = 1e-12
+"""Information added to every direction of a matrix with unit diagonal."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LoopDecision:
-    """What became of a planned loop.
+    """The decision on a planned loop.
 
     Args:
         submodel: position of the submodel that holds both ends, or None.
         edges: positions of the alignments with a window of the first and of the second end; empty where
             one is missing.
         accepted: it takes part in the graph.
-        reason: why not, or empty.
-        closure_sigmas: distance between the way through the loop and the chain, in standard deviations
+        reason: of the rejection, or empty.
+        closure_sigmas: distance between the transform through the loop and that of the chain, in standard deviations
             per degree of freedom; NaN where there is no chain between the ends.
     """
 
@@ -62,7 +62,7 @@ class UncertainTransform:
     covariance: FloatArray
 
     def __matmul__(self, after: UncertainTransform) -> UncertainTransform:
-        """``c_from_a = c_from_b @ b_from_a``; a perturbation of the left factor is carried to the right."""
+        """``c_from_a = c_from_b @ b_from_a``; perturbations move to the right by the adjoint."""
         carry = after.b_from_a.inverse().adjoint()
         return UncertainTransform(
             b_from_a=self.b_from_a @ after.b_from_a,
@@ -127,17 +127,14 @@ def _verify(
         through_loop = _of_edge(first) @ _of_edge(second).inverse()
         sigmas = chain.transform(first.target, second.target).sigmas_from(through_loop)
         if sigmas > MAX_CLOSURE_SIGMAS:
-            reason = (
-                f"it contradicts the chain of windows by {sigmas:.1f} standard deviations, "
-                f"at most {MAX_CLOSURE_SIGMAS:.0f}"
-            )
+            reason = f"inconsistent with the chain of windows ({sigmas:.1f} sigma, at most {MAX_CLOSURE_SIGMAS:.0f})"
     return LoopDecision(submodel=best, accepted=not reason, edges=edges, reason=reason, closure_sigmas=sigmas)
 
 
 def _why_no_submodel(held: Sequence[Sequence[int]]) -> str:
-    """What is wrong with submodels that hold so many images of each end."""
+    """The rejection reason, from the images of each end that the submodels hold."""
     if not held:
-        return "nothing came out of the loop segment"
+        return "the loop segment has no submodel"
     counts = ", ".join(" + ".join(map(str, one)) for one in held)
     return f"no submodel of the loop segment holds {MIN_END_IMAGES} images of both ends (submodels of {counts})"
 
@@ -170,19 +167,19 @@ def _of_edge(edge: SegmentAlignment) -> UncertainTransform:
 
 
 def covariance_of(information: FloatArray) -> FloatArray:
-    """(d, d) inverse of an information matrix; what it leaves open gets a very large variance.
+    """(d, d) inverse of an information matrix; unmeasured directions get a very large variance.
 
-    A pseudo-inverse would give it none at all. Rows are brought to like size first, for a tangent
+    A pseudo-inverse would give them zero variance. The diagonal is scaled to one first, because a tangent
     vector mixes lengths, angles and their inverses.
     """
     size = np.sqrt(np.diag(information))
     units = np.outer(*2 * [np.where(size > 0, size, 1.0)])
-    covariance: FloatArray = np.linalg.inv(information / units + NOTHING_KNOWN * np.eye(len(size))) / units
+    covariance: FloatArray = np.linalg.inv(information / units + MIN_UNIT_INFORMATION * np.eye(len(size))) / units
     return covariance
 
 
 class _Chain:
-    """The spanning trees of the windows, with the uncertainty that adds up along them."""
+    """The spanning trees of the windows, with the covariance that accumulates along them."""
 
     def __init__(self, alignments: Sequence[SegmentAlignment], parts: Sequence[ChainedPart]) -> None:
         self._part = {submodel: number for number, part in enumerate(parts) for submodel in part.submodels}
@@ -195,7 +192,7 @@ class _Chain:
                 self._steps[source][target] = edge.inverse()
 
     def connects(self, a: int, b: int) -> bool:
-        """Whether there is a way from a to b."""
+        """Whether a and b are in one component."""
         return self._part[a] == self._part[b]
 
     def transform(self, a: int, b: int) -> UncertainTransform:

@@ -2,7 +2,7 @@
 
 Under Sim(3) and SE(3) a camera moves with its submodel. Affine(3) and SL(4) bend the submodel, and no rigid
 camera sees the bent points quite as the submodel's own camera saw the straight ones: it is found anew,
-image by image, and what remains is reported in pixels. The next module to read is ``fusion``.
+image by image, and what remains is reported in pixels. The next module to read is ``camera_fusion``.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """From alignments between submodels to one frame per connected part.
 
 The chain is the best spanning tree of the accepted edges: the one whose edges rest on most inliers.
-In a plain sequence that is the chain of neighbouring segments; where a segment came out in submodels,
-it is whatever holds them together. What no edge reaches stays a part of its own. The pose graph
-takes the chain as its start; the next module to read is ``stitching``.
+In a plain sequence that is the chain of neighbouring segments. Submodels that no edge reaches are parts
+of their own. The pose graph takes the chain as its start; the next module to read is ``stitch``.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import SegmentAlignment
 
-LOOP_HANDICAP = 1e-6
+LOOP_STRENGTH_FACTOR = 1e-6
 """Factor on the strength of edges to loops: they belong to the tree only where nothing else connects."""
 
 
@@ -60,7 +59,9 @@ def chain_submodels(
     for position, edge in enumerate(alignments):
         if not edge.accepted or edge.target not in place or edge.source not in place:
             continue
-        strength[position] = _strength(edge) * (LOOP_HANDICAP if edge.target in loops or edge.source in loops else 1.0)
+        strength[position] = _strength(edge) * (
+            LOOP_STRENGTH_FACTOR if edge.target in loops or edge.source in loops else 1.0
+        )
         pair = (min(edge.target, edge.source), max(edge.target, edge.source))
         if pair not in best or strength[position] > strength[best[pair]]:
             best[pair] = position

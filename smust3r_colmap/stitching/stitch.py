@@ -1,8 +1,8 @@
-"""From edges to frames: the chain, the loops that can be believed, the pose graph (paper section III-F).
+"""From edges to frames: the chain, the accepted loops, the pose graph (paper section III-F).
 
-Submodels are chained along their overlaps first. Every loop segment then has to prove itself
-(``loops.verification``), the sound ones become nodes of the graph, and all frames are optimised
-together. What the graph rejects is taken out again. The next module to read is ``fusion``.
+Submodels are chained along their overlaps first. Every loop segment is then verified
+(``loop_verification``), the accepted ones become nodes of the graph, and all frames are optimised
+together. Loops that the graph rejects are removed again. The next module to read is ``camera_fusion``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import SegmentAlignment, Submodel
 from smust3r_colmap.segmentation.loop_segments import PlannedLoop
 from smust3r_colmap.stitching.loop_verification import LoopDecision, verify_loops
-from smust3r_colmap.stitching.pose_graph.graph import TRUSTED, PoseGraph
+from smust3r_colmap.stitching.pose_graph.graph import ODOMETRY, PoseGraph
 from smust3r_colmap.stitching.pose_graph.optimise import GraphSolution, optimise
 from smust3r_colmap.stitching.spanning_tree import ChainedPart, chain_submodels
 
@@ -49,7 +49,7 @@ class Stitching:
         parts: the connected parts after the graph, loop submodels among their submodels.
         decisions: one per planned loop.
         gaps: per planned loop, its gap in ``chained`` and in ``parts``.
-        solution: what the optimiser says of itself.
+        solution: what the optimiser reports.
         num_edges: of the graph.
     """
 
@@ -69,7 +69,7 @@ def stitch(
     group: type[Transform],
     kernel: LoopKernel,
 ) -> Stitching:
-    """Chain the windows, verify the loops, optimise the graph, take out what it rejects.
+    """Chain the windows, verify the loops, optimise the graph, remove the loops that it rejects.
 
     Args:
         submodels: of windows and loop segments.
@@ -82,15 +82,15 @@ def stitch(
     windows = [k for k, submodel in enumerate(submodels) if submodel.segment not in loop_segments]
     chained = chain_submodels(windows, alignments, group=group)
     decisions = list(verify_loops(loops, submodels, alignments, chained))
-    believed = [number for number, one in enumerate(decisions) if one.accepted]
-    loop_submodels = {_submodel(decisions[number]): k for k, number in enumerate(believed)}
+    accepted = [number for number, one in enumerate(decisions) if one.accepted]
+    loop_submodels = {_submodel(decisions[number]): k for k, number in enumerate(accepted)}
     start = chain_submodels([*windows, *loop_submodels], alignments, loops=loop_submodels, group=group)
     graph, world_from_node, node_of = _graph(start, alignments, loop_submodels, group)
     solution = optimise(graph, world_from_node, kernel=kernel)
     for k in solution.rejected_loops:
-        number = believed[k]
+        number = accepted[k]
         sigmas = np.sqrt(solution.loop_distances[k] / (solution.information_scale * group.DOF))
-        reason = f"the other edges of the graph contradict it by {sigmas:.1f} standard deviations"
+        reason = f"inconsistent with the other edges of the pose graph ({sigmas:.1f} sigma)"
         decisions[number] = replace(decisions[number], accepted=False, reason=reason)
     if solution.stop_reason != "nothing to do":
         for number in _left_open(start, decisions, world_from_node, solution, node_of):
@@ -127,7 +127,7 @@ def _left_open(
     solution: GraphSolution,
     node_of: Mapping[int, int],
 ) -> list[int]:
-    """Believed loops of parts that no step improved, unless nothing else holds their windows together."""
+    """Accepted loops of parts that no step improved, unless nothing else holds their windows together."""
     moved = (solution.world_from_node.matrix != world_from_node.matrix).any(axis=(-1, -2))
     at_rest = {
         submodel
@@ -154,7 +154,7 @@ def _graph(
     }
     node_of = {submodel: node for node, submodel in enumerate(sorted(frames))}
     edges = [edge for edge in alignments if edge.accepted and edge.target in node_of and edge.source in node_of]
-    # Points and cameras of one pair share the bending of their submodels: two edges say no more than one.
+    # Points and cameras of one pair share the distortion of their submodels: two edges inform no more than one.
     times = Counter((edge.target, edge.source) for edge in edges)
     information = [edge.information / times[edge.target, edge.source] for edge in edges]
     graph = PoseGraph(
@@ -174,7 +174,7 @@ def _batch(transforms: Sequence[Transform], group: type[Transform]) -> Transform
 
 def _loop_of(edge: SegmentAlignment, loop_submodels: Mapping[int, int]) -> int:
     """Number of the loop an edge belongs to; the source is the later submodel, and loops come after windows."""
-    return loop_submodels.get(edge.source, TRUSTED)
+    return loop_submodels.get(edge.source, ODOMETRY)
 
 
 def _placed(part: ChainedPart, world_from_node: Transform, node_of: Mapping[int, int]) -> ChainedPart:

@@ -10,10 +10,10 @@ import pytest
 from helpers.scenes import make_submodel, some_sim3, walk
 
 from smust3r_colmap.alignment.uncertainty import (
-    FLOOR,
     OBSERVATIONS_PER_IMAGE,
-    UNKNOWN,
-    honest_information,
+    SIGMA_FLOOR,
+    SIGMA_UNMEASURED,
+    inflated_information,
     overlap_centre,
 )
 from smust3r_colmap.geometry.arrays import FloatArray
@@ -49,7 +49,7 @@ def honest(
     depth: float = DEPTH,
     group: type[Transform] | None = None,
 ) -> FloatArray:
-    return honest_information(estimate, num_images=num_images, centre_source=centre, depth_source=depth, group=group)
+    return inflated_information(estimate, num_images=num_images, centre_source=centre, depth_source=depth, group=group)
 
 
 def some_information(dof: int, *, size: float = 1e4) -> FloatArray:
@@ -72,13 +72,13 @@ def test_no_evidence_beats_the_floor_at_the_middle_of_the_overlap(group: type[Tr
     adjoint = at(group, CENTRE)
     covariance = np.linalg.inv(adjoint.T @ honest(sure) @ adjoint)
     deviations = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(deviations[:3], FLOOR * DEPTH, rtol=1e-3)
+    np.testing.assert_allclose(deviations[:3], SIGMA_FLOOR * DEPTH, rtol=1e-3)
     if group.DOF <= 7:
-        np.testing.assert_allclose(deviations[3:], FLOOR, rtol=1e-3)
+        np.testing.assert_allclose(deviations[3:], SIGMA_FLOOR, rtol=1e-3)
     else:  # one entry of the linear part is a turn and a shear, or a scale and a stretch
-        assert (deviations[3:12] > FLOOR).all()
-        assert (deviations[3:12] < 2 * FLOOR).all()
-    np.testing.assert_allclose(deviations[12:], FLOOR / DEPTH, rtol=1e-3)
+        assert (deviations[3:12] > SIGMA_FLOOR).all()
+        assert (deviations[3:12] < 2 * SIGMA_FLOOR).all()
+    np.testing.assert_allclose(deviations[12:], SIGMA_FLOOR / DEPTH, rtol=1e-3)
 
 
 @ALL_GROUPS
@@ -152,7 +152,7 @@ def test_far_from_the_origin_a_turn_stays_a_turn_about_the_overlap() -> None:
     covariance = np.linalg.inv(honest(sure))
     moves = np.linalg.inv(at(Sim3, CENTRE))[:3]
     shift = np.sqrt(np.trace(moves @ covariance @ moves.T))
-    assert shift == pytest.approx(np.sqrt(3) * FLOOR * DEPTH, rel=1e-6)
+    assert shift == pytest.approx(np.sqrt(3) * SIGMA_FLOOR * DEPTH, rel=1e-6)
     origin = np.sqrt(np.trace(covariance[:3, :3]))
     assert origin > 5 * shift
 
@@ -176,7 +176,7 @@ def test_shear_between_submodels_related_by_a_similarity_is_vaguely_none() -> No
     shear = np.zeros((4, 4))
     shear[0, 1] = shear[1, 0] = 1.0
     tangent = group.vee(shear)
-    assert tangent @ wide @ tangent == pytest.approx(1 / (UNKNOWN**2 + FLOOR**2), rel=1e-6)
+    assert tangent @ wide @ tangent == pytest.approx(1 / (SIGMA_UNMEASURED**2 + SIGMA_FLOOR**2), rel=1e-6)
 
 
 # ------------------------------------------------------------------------------- refusals

@@ -21,7 +21,7 @@ from helpers.dense_scenes import (
     undistorted,
 )
 
-from smust3r_colmap.dense import depth_consistency as model_depth
+from smust3r_colmap.dense import depth_consistency as depth_consistency
 from smust3r_colmap.dense.depth_consistency import ModelDepth, depth_of_model, sample_depth
 from smust3r_colmap.errors import InputError
 
@@ -103,7 +103,7 @@ def depth_by_the_rule(depth: FloatMap, x: float, y: float) -> float:
         return 0.0
     j, i = int(max(x - 0.5, 0)), int(max(y - 0.5, 0))
     four = depth[np.ix_([i, min(i + 1, height - 1)], [j, min(j + 1, width - 1)])].astype(np.float64)
-    if four.min() <= 0 or four.max() > four.min() * (1 + model_depth.DEPTH_EDGE):
+    if four.min() <= 0 or four.max() > four.min() * (1 + depth_consistency.DEPTH_EDGE):
         return float(depth[int(y), int(x)])
     right, down = max(x - 0.5, 0) - j, max(y - 0.5, 0) - i
     return float(1 / (np.array([1 - down, down]) @ (1 / four) @ np.array([1 - right, right])))
@@ -156,7 +156,7 @@ def test_an_image_with_few_points_takes_the_scale_of_the_model(pinholes: pycolma
     model = exact_model()
     lonely = model.find_image_with_name("left/e.webp")
     observed = [index for index, point in enumerate(lonely.points2D) if point.has_point3D()]
-    for index in observed[model_depth.MIN_POINTS - 1 :]:
+    for index in observed[depth_consistency.MIN_SCALE_POINTS - 1 :]:
         model.delete_observation(lonely.image_id, index)
     depths = {name: 2 * depth for name, depth in exact_maps().items()}
     depths["left/e.webp"] *= 1.1  # which its few points would say, were they asked
@@ -224,27 +224,27 @@ def test_two_images_confirm_each_other_and_one_stays_as_it_is(model: pycolmap.Re
 
 
 def test_views_from_the_same_place_are_asked_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(model_depth, "CHECK_NEIGHBOURS", 2)
+    monkeypatch.setattr(depth_consistency, "CHECK_NEIGHBOURS", 2)
     xyz = np.random.default_rng(1).uniform([-1, -1, 4], [1, 1, 6], (50, 3))
     everything = np.arange(50)
-    sightings = model_depth._Sightings(
+    sightings = depth_consistency._Sightings(
         xyz=xyz,
         track_lengths=np.full(50, 4.0),
         points=dict.fromkeys((1, 2, 3, 4), everything) | {4: everything[:30]},
         xy={},
     )
-    base = model_depth._View(img_from_cam=np.eye(3), cam_from_world=np.eye(4)[:3])
+    base = depth_consistency._View(img_from_cam=np.eye(3), cam_from_world=np.eye(4)[:3])
     views = {1: base}
     for i, x in ((2, 0.01), (3, 0.5), (4, -0.5)):
         views[i] = replace(base, cam_from_world=np.column_stack([np.eye(3), [-x, 0, 0]]))
-    assert model_depth._neighbours(sightings, views)[1] == [3, 4]
+    assert depth_consistency._neighbours(sightings, views)[1] == [3, 4]
 
 
 def test_memory_for_neighbours_changes_nothing_but_time(
     model: pycolmap.Reconstruction, pinholes: pycolmap.Reconstruction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     expected = list(depth_of_model(model, pinholes, maps_of(exact_maps())))
-    monkeypatch.setattr(model_depth, "CACHE_BYTES", 0)
+    monkeypatch.setattr(depth_consistency, "CACHE_BYTES", 0)
     for one, again in zip(expected, depth_of_model(model, pinholes, maps_of(exact_maps())), strict=True):
         np.testing.assert_array_equal(one.depth, again.depth)
 

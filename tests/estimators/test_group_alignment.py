@@ -12,7 +12,7 @@ from helpers.room_overlap import SIMILARITY, TURN, room_overlap
 from scipy.linalg import logm
 from scipy.spatial.transform import Rotation
 
-from smust3r_colmap.alignment.seen_points import absurdity, align_seen_points
+from smust3r_colmap.alignment.seen_points import align_seen_points, implausibility
 from smust3r_colmap.config import RobustKernel, TransformGroup
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.estimators.affine3 import estimate_affine3
@@ -361,11 +361,11 @@ def test_absurd_stretch_falls_back_to_sim3(group: BendingGroup) -> None:
 
 def test_points_near_the_plane_at_infinity_are_absurd() -> None:
     points = np.random.default_rng(10).uniform(-1, 1, (500, 3))
-    assert absurdity(SL4.identity(), points) == ""
-    assert absurdity(SL4.exp([0.0] * 12 + [0.2, 0.0, 0.0]), points) == ""
+    assert implausibility(SL4.identity(), points) == ""
+    assert implausibility(SL4.exp([0.0] * 12 + [0.2, 0.0, 0.0]), points) == ""
     near = SL4.exp([0.0] * 12 + [0.95, 0.0, 0.0])
-    assert absurdity(near, points).startswith("a point is at 0.0")
-    assert absurdity(SL4.exp([0.0] * 12 + [2.0, 0.0, 0.0]), points).startswith("a point is at -")
+    assert implausibility(near, points).startswith("a point is at 0.0")
+    assert implausibility(SL4.exp([0.0] * 12 + [2.0, 0.0, 0.0]), points).startswith("a point is at -")
 
 
 # ------------------------------------------------------------------------------- bad input

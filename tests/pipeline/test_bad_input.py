@@ -308,7 +308,7 @@ def test_cameras_that_deny_the_points_of_their_segment_are_not_believed(truth: T
     stretched[:, :, 3] *= 1.5
     run = with_submodel(run, 2, replace(submodel, seg_from_cam=stretched), run.result.dense[2])
     solved = run.solved()
-    assert any("it denies the edge from pointmaps" in reason for reason in reasons(solved))
+    assert any("inconsistent with the edge from pointmaps (" in reason for reason in reasons(solved))
     assert len(solved.stitching.parts) == 1
 
 
@@ -317,7 +317,7 @@ def test_points_of_another_place_are_refused_and_so_are_the_cameras_beside_them(
     solved = run.solved()
     assert_sound(run, solved)
     assert any("of the depth, at most 0.05" in reason for reason in reasons(solved))
-    assert "the points of the same images were refused" in reasons(solved)
+    assert "the edge from points of the same images was rejected" in reasons(solved)
     assert (2,) in {part.submodels for part in solved.stitching.parts}
 
 

@@ -14,7 +14,7 @@ from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.stitching.pose_graph.contract import contract
-from smust3r_colmap.stitching.pose_graph.graph import TRUSTED, PoseGraph
+from smust3r_colmap.stitching.pose_graph.graph import ODOMETRY, PoseGraph
 from smust3r_colmap.stitching.pose_graph.levenberg import levenberg_marquardt, quadratic
 from smust3r_colmap.stitching.pose_graph.linearise import (
     NormalEquations,
@@ -23,9 +23,9 @@ from smust3r_colmap.stitching.pose_graph.linearise import (
     linearise,
     squared_distances,
 )
+from smust3r_colmap.stitching.pose_graph.loop_selection import leave_one_out
 from smust3r_colmap.stitching.pose_graph.normalise import Normalisation
 from smust3r_colmap.stitching.pose_graph.optimise import optimise
-from smust3r_colmap.stitching.pose_graph.robust import leave_one_out
 from smust3r_colmap.stitching.pose_graph.start import linear_part, only_linear, part_of
 
 SIGMAS = np.array([0.01] * 3 + [np.deg2rad(0.3)] * 3 + [0.01])
@@ -485,7 +485,7 @@ def test_contradictory_sequence_edges_meet_in_the_middle() -> None:
     np.testing.assert_allclose(found.world_from_node.matrix[:, 0, 3], [0.0, 0.01, 0.02], atol=1e-5)
 
 
-def test_a_loop_that_alone_joins_two_parts_is_believed() -> None:
+def test_a_loop_that_alone_joins_two_parts_is_accepted() -> None:
     _, graph, start, _ = measured_ring(20, 1)
     last = graph.target[-1]  # of the part before the cut, where the loop begins
     cut = graph.with_edges(np.flatnonzero((graph.target != last) | (graph.loop >= 0)))[0]
@@ -536,7 +536,7 @@ def test_a_worse_state_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_lone_wrong_loop_leaves_the_chain_as_it_is(seed: int) -> None:
     _, graph, start, _ = measured_ring(201, 1, 1, seed=seed)
     found = optimise(graph, start)
-    assert found.rejected_loops.tolist() == [0] and found.stop_reason == "no loop believed"
+    assert found.rejected_loops.tolist() == [0] and found.stop_reason == "no loop accepted"
     assert not found.improved and found.world_from_node is start
     assert found.loop_distances[0] > 9 * chi2.ppf(1 - 1e-5, 7)  # the sequence may be three times worse than it says
 
@@ -558,7 +558,7 @@ def test_singular_information_leaves_the_rest_to_the_others() -> None:
 
 def test_chosen_edges_keep_their_loops_under_new_numbers() -> None:
     _, graph, _, _ = measured_ring(20, 5)
-    chain = np.flatnonzero(graph.loop == TRUSTED)
+    chain = np.flatnonzero(graph.loop == ODOMETRY)
     some, loops = graph.with_edges(np.concatenate([chain, np.flatnonzero(np.isin(graph.loop, [1, 4]))]))
     assert (some.num_nodes, some.num_loops, loops.tolist()) == (20, 2, [1, 4])
     assert some.loop[len(chain) :].tolist() == [0, 1]

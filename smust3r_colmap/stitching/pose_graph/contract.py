@@ -16,7 +16,7 @@ import numpy as np
 
 from smust3r_colmap.geometry.arrays import BoolArray, FloatArray, IntArray
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.stitching.pose_graph.graph import TRUSTED, PoseGraph
+from smust3r_colmap.stitching.pose_graph.graph import ODOMETRY, PoseGraph
 from smust3r_colmap.stitching.pose_graph.linearise import edge_errors, inverse_right_jacobian
 
 SINGULAR_RIDGE = 1e-12
@@ -64,7 +64,7 @@ class Contraction:
 
 
 def contract(graph: PoseGraph, state: Transform, kept: BoolArray) -> Contraction:
-    """Takes out every node that hangs on one trusted edge, or on two of the same kind (trusted, or of one loop).
+    """Takes out every node that hangs on one odometry edge, or on two edges of one kind (odometry, or one loop).
 
     Parallel edges of one kind are averaged under their information first.
 
@@ -191,7 +191,7 @@ def _independent(edges: _Edges, kept: BoolArray) -> IntArray:
     lowest, highest = np.full(num_nodes, np.iinfo(np.int64).max), np.full(num_nodes, -2)
     np.minimum.at(lowest, ends, kinds)
     np.maximum.at(highest, ends, kinds)
-    hangs = (degree == 1) & (highest == TRUSTED)  # a hanging loop must stay in sight
+    hangs = (degree == 1) & (highest == ODOMETRY)  # a loop with a node of its own stays in the small graph
     can_go = ~kept & (hangs | ((degree == 2) & (lowest == highest)))
     # Scattered priorities (Knuth's multiplicative hash): of a row of candidates about every third goes.
     priority = np.where(can_go, np.arange(num_nodes) * 2654435761 % 2**32, -1)

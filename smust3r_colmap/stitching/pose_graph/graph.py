@@ -1,7 +1,8 @@
 """The pose graph as a value: nodes are segments, edges are measured transforms between them.
 
-Edges of the sequence are trusted. The others belong to loops: all edges of a loop stand or fall
-together, because a false loop is false in every one of them. The next module to read is ``linearise``.
+Odometry edges join submodels of the sequence. The others are loop closures. All edges of a loop are
+accepted or rejected together, because a false loop is false in every one of them. The next module to read
+is ``linearise``.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from scipy.sparse.csgraph import connected_components
 from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.geometry.transform import Transform
 
-TRUSTED = -1
-"""Loop number of the edges of the sequence, which no kernel touches."""
+ODOMETRY = -1
+"""Loop number of odometry edges; the robust kernel does not apply to them."""
 SEMIDEFINITE_TOLERANCE = 1e-8
 """Smallest eigenvalue of an information matrix over its largest entry; rounding of a rank-deficient one."""
 
@@ -33,7 +34,7 @@ class PoseGraph:
         target_from_source: batch (M,), of any group.
         information: (M, DOF, DOF) inverse covariance of the right perturbation
             ``target_from_source @ exp(delta)``; it may be singular.
-        loop: (M,) number of the loop that the edge belongs to, or -1 for edges that are trusted.
+        loop: (M,) number of the loop that the edge belongs to, or -1 for odometry edges.
             Loops are numbered from 0 without gaps.
 
     Raises:
@@ -73,7 +74,7 @@ class PoseGraph:
         same = np.flatnonzero(self.target == self.source)
         if len(same):
             raise ValueError(f"PoseGraph: edge {same[0]} joins node {self.target[same[0]]} to itself")
-        loops = np.unique(self.loop[self.loop != TRUSTED])
+        loops = np.unique(self.loop[self.loop != ODOMETRY])
         if len(loops) and (loops[0] < 0 or loops[-1] != len(loops) - 1):
             raise ValueError(
                 f"PoseGraph: loops must be numbered from 0 without gaps, found {loops[:5]} ... {loops[-1]}"
@@ -85,7 +86,7 @@ class PoseGraph:
     @property
     def num_loops(self) -> int:
         """Number of loops, each of one edge or more."""
-        return int(self.loop.max(initial=TRUSTED)) + 1
+        return int(self.loop.max(initial=ODOMETRY)) + 1
 
     @cached_property
     def source_from_target(self) -> Transform:
@@ -101,7 +102,7 @@ class PoseGraph:
     def with_edges(self, edges: IntArray) -> tuple[PoseGraph, IntArray]:
         """The same nodes and some of the edges; the loops that are left, by their numbers here, are renumbered."""
         loops, loop = np.unique(self.loop[edges], return_inverse=True)
-        if len(loops) and loops[0] == TRUSTED:
+        if len(loops) and loops[0] == ODOMETRY:
             loops, loop = loops[1:], loop - 1
         graph = replace(
             self,
@@ -123,13 +124,13 @@ class PoseGraph:
 
 def loop_sums(values: FloatArray, loop: IntArray, num_loops: int) -> FloatArray:
     """(num_loops,) sum of (M,) values over the edges of each loop."""
-    member = loop != TRUSTED
+    member = loop != ODOMETRY
     sums: FloatArray = np.bincount(loop[member], weights=values[member], minlength=num_loops).astype(np.float64)
     return sums
 
 
 def edge_weights(loop_weights: FloatArray, loop: IntArray) -> FloatArray:
-    """(M,) weight of each edge: one for trusted edges, its loop's for the others."""
+    """(M,) weight of each edge: one for odometry edges, that of its loop for the others."""
     return np.concatenate([loop_weights, [1.0]])[loop]
 
 

@@ -30,7 +30,7 @@ FIRST_DAMPING = 1e-12
 """Of the Hessian's diagonal: Gauss-Newton. More would hold back the slow bending of a long sequence, whose
 curvature is 1e-8 of the diagonal and less."""
 RETRY_DAMPING = 1e-8
-"""Least damping after a refused step; it doubles, then quadruples, and so on, until a step helps."""
+"""Least damping after a rejected step; it doubles, then quadruples, and so on, until a step helps."""
 LAST_DAMPING = 1e8
 """With this much damping a step is a minute move downhill; if it does not help, rounding is all there is."""
 SMALL_STEP = 1e-10
@@ -74,9 +74,9 @@ def truncated(loss: Loss, threshold: FloatArray) -> Loss:
 
 
 def total_cost(graph: PoseGraph, loss: Loss, squared: FloatArray) -> float:
-    """Squared distances (M,) of the trusted edges plus the loss of the loops."""
-    trusted = squared[graph.loop < 0].sum()
-    return float(trusted + loss.cost(loop_sums(squared, graph.loop, graph.num_loops)).sum())
+    """Squared distances (M,) of the odometry edges plus the loss of the loops."""
+    odometry = squared[graph.loop < 0].sum()
+    return float(odometry + loss.cost(loop_sums(squared, graph.loop, graph.num_loops)).sum())
 
 
 def levenberg_marquardt(
@@ -96,7 +96,7 @@ def levenberg_marquardt(
 
     Args:
         held: (num_nodes,) nodes that do not move.
-        max_iterations: of accepted and refused steps together.
+        max_iterations: of accepted and rejected steps together.
         relative_decrease: of the cost, below which it has converged.
         equations: the pattern of the graph, if it was prepared before.
     """

@@ -3,7 +3,7 @@
 In SL(4) lengths mix with the projective row, and a solver that meets coordinates of hundreds of
 units stops at once. Nodes become ``S C X S^-1`` and edges ``S Z S^-1``, with C moving the centre of
 the nodes to the origin and S scaling: the world moves, and every frame changes its unit of length.
-The next module to read is ``robust``.
+The next module to read is ``loop_selection``.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """The pose graph solved: ``optimise``, the only function that the rest of the package needs.
 
 Each connected component by itself, with its first node held, in coordinates centred and scaled to
-radius one: the linear parts, then the translations, then both, judging the loops on the way; then
-the contracted graph anew about each result until no loop changes sides; then the whole graph under
-the kernel. ``robust`` says how loops are judged, ``start`` why it begins with the linear parts.
+radius one: the linear parts, then the translations, then both, with the inlier test of the loops
+in between; then the contracted graph, linearised anew about each result until the inliers no longer
+change; then the whole graph under the kernel. ``loop_selection`` has the inlier test of the loops,
+``start`` says why the linear parts come first.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from scipy.special import chdtri
 from smust3r_colmap.geometry.arrays import BoolArray, FloatArray, IntArray
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.stitching.pose_graph.contract import contract
-from smust3r_colmap.stitching.pose_graph.graph import TRUSTED, PoseGraph, loop_sums
+from smust3r_colmap.stitching.pose_graph.graph import ODOMETRY, PoseGraph, loop_sums
 from smust3r_colmap.stitching.pose_graph.levenberg import (
     cauchy,
     levenberg_marquardt,
@@ -28,8 +29,8 @@ from smust3r_colmap.stitching.pose_graph.levenberg import (
     truncated,
 )
 from smust3r_colmap.stitching.pose_graph.linearise import NormalEquations, edge_errors, squared_distances
+from smust3r_colmap.stitching.pose_graph.loop_selection import LoopInlierTest, LoopSelection, descended, loop_weights_of
 from smust3r_colmap.stitching.pose_graph.normalise import Normalisation
-from smust3r_colmap.stitching.pose_graph.robust import Belief, Judge, descended, loop_weights_of
 from smust3r_colmap.stitching.pose_graph.start import (
     TRANSLATION,
     linear_part,
@@ -43,32 +44,32 @@ logger = logging.getLogger(__name__)
 Kernel = Literal["cauchy", "gnc", "none"]
 
 CONTRACTIONS = 4
-"""Times that the long stretches are linearised anew; loops change sides in the first two, if at all."""
+"""Times that the long stretches are linearised anew; inliers change in the first two, if at all."""
 RECONSIDERATIONS = 5
-"""Times that loops may change sides on one small graph; 1 or 2 are usual."""
-NO_COST = 1e-16
+"""Times that the inliers may change on one small graph; 1 or 2 are typical."""
+ROUNDING_COST_PER_EDGE = 1e-16
 """Squared Mahalanobis distance per edge that is rounding: the nodes stand as measured."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GraphSolution:
-    """Where the nodes stand, and which loops hold them there.
+    """The optimised nodes and the accepted loops.
 
-    Costs are sums of squared Mahalanobis distances under the robust objective: a trusted edge counts
+    Costs are sums of squared Mahalanobis distances under the robust objective: an odometry edge counts
     with its distance, a loop with the kernel's loss of its distance, but with no more than its
-    threshold, the price of rejecting it. Both costs use the same thresholds.
+    threshold, the cost of rejecting it. Both costs use the same thresholds.
 
     Args:
         world_from_node: batch (num_nodes,); the start, untouched, where ``improved`` is False.
         cost_before, cost_after: at the start and here.
         iterations: on the whole graph, the most of any component.
         stop_reason: ``"converged by cost"``, ``"converged by step"``, ``"iteration limit"``, ``"stuck"``
-            (no step lowers the cost), ``"nothing to do"`` (all nodes stand as measured), ``"no loop believed"``
+            (no step lowers the cost), ``"nothing to do"`` (all nodes stand as measured), ``"no loop accepted"``
             or ``"worse than the start"`` (the start is returned); where components differ, each reason once.
         improved: the cost fell.
         loop_weights: (L,) weight in [0, 1] that the kernel gave to each loop; 0 for rejected ones.
         loop_distances: (L,) squared Mahalanobis distance of each loop to the prediction of the rest of
-            the graph; NaN where nothing was judged (kernel ``"none"``) or nothing else predicts it.
+            the graph; NaN where nothing was tested (kernel ``"none"``) or no other edge predicts it.
         rejected_loops: numbers of the loops that were left out, ascending.
         information_scale: factor by which squared distances were found too large, the largest of any component.
     """
@@ -95,19 +96,19 @@ def optimise(
     max_iterations: int = 50,
     relative_decrease: float = 1e-8,
 ) -> GraphSolution:
-    """The states that fit all edges best, and the loops that contradict the others.
+    """The states that fit all edges best, and the loops that are outliers.
 
-    The first node of every connected component stays where it is. Loops are judged by what they cost
-    the rest of the graph (see ``robust``); a rejected loop pulls no longer. ``"cauchy"`` then also
-    weighs the loops that stay, ``"gnc"`` gives them their full weight (truncated least squares),
-    ``"none"`` believes all loops, as the paper does.
+    The first node of every connected component is held. Loops are tested by their leave-one-out cost
+    (see ``loop_selection``); a rejected loop has no weight. ``"cauchy"`` also weighs the accepted
+    loops, ``"gnc"`` gives them full weight (truncated least squares), ``"none"`` accepts all loops,
+    as the paper does.
 
     Args:
         graph: nodes and edges.
         world_from_node: batch (num_nodes,) in the group of the edges, where to begin.
         confidence: share of the true loops that stay below the threshold; the default loses one of 100,000.
         tolerance: factor by which standard deviations may be too small without a lone true loop being
-            rejected. With many loops larger factors are found out (see ``robust.information_scale``).
+            rejected. With many loops larger factors are estimated (see ``loop_selection.information_scale``).
         max_iterations: of the descent on the whole graph.
         relative_decrease: of the cost, below which that descent has converged.
 
@@ -185,19 +186,21 @@ def _optimise_component(
 ) -> GraphSolution:
     """A connected graph, its first node held."""
     before = squared_distances(edge_errors(graph, start).residual, graph.information)
-    if before.sum() <= NO_COST * len(graph):
+    if before.sum() <= ROUNDING_COST_PER_EDGE * len(graph):
         return _start_kept(graph, start, float(before.sum()), 0, "nothing to do")
     normal = Normalisation.about(start)
     unit_graph, unit_start = normal.graph(graph), normal.state(start)
     held = np.arange(graph.num_nodes) == 0
-    judge = None if kernel == "none" or not graph.num_loops else Judge(confidence=confidence, tolerance=tolerance)
-    belief = _believed(unit_graph, unit_start, held, judge)
-    threshold = _kernel_thresholds(unit_graph, belief, confidence)
-    weights = loop_weights_of(belief.kept)
+    inlier_test = (
+        None if kernel == "none" or not graph.num_loops else LoopInlierTest(confidence=confidence, tolerance=tolerance)
+    )
+    selection = _select_loops(unit_graph, unit_start, held, inlier_test)
+    threshold = _kernel_thresholds(unit_graph, selection, confidence)
+    weights = loop_weights_of(selection.kept)
     loss = cauchy(weights, threshold) if kernel == "cauchy" else quadratic(weights)
     end = levenberg_marquardt(
         unit_graph,
-        belief.world_from_node,
+        selection.world_from_node,
         held,
         loss,
         max_iterations=max_iterations,
@@ -205,15 +208,15 @@ def _optimise_component(
     )
     full = np.ones(graph.num_loops)
     whole = quadratic(full) if kernel != "cauchy" else cauchy(full, threshold)
-    objective = whole if judge is None else truncated(whole, threshold)
+    objective = whole if inlier_test is None else truncated(whole, threshold)
     after = squared_distances(edge_errors(unit_graph, end.world_from_node).residual, unit_graph.information)
     cost_before, cost_after = total_cost(graph, objective, before), total_cost(graph, objective, after)
     if not cost_after < cost_before:
         reason = "worse than the start" if cost_after > cost_before else end.stop_reason
-        if graph.num_loops and not belief.kept.any():
-            reason = "no loop believed"
-        return _start_kept(graph, start, cost_before, end.iterations, reason, belief)
-    loop_weight = np.where(belief.kept, loss.weight(loop_sums(after, graph.loop, graph.num_loops)), 0.0)
+        if graph.num_loops and not selection.kept.any():
+            reason = "no loop accepted"
+        return _start_kept(graph, start, cost_before, end.iterations, reason, selection)
+    loop_weight = np.where(selection.kept, loss.weight(loop_sums(after, graph.loop, graph.num_loops)), 0.0)
     return GraphSolution(
         world_from_node=normal.undone(end.world_from_node),
         cost_before=cost_before,
@@ -222,17 +225,22 @@ def _optimise_component(
         stop_reason=end.stop_reason,
         improved=True,
         loop_weights=loop_weight,
-        loop_distances=belief.distance,
-        rejected_loops=np.flatnonzero(~belief.kept),
-        information_scale=belief.scale,
+        loop_distances=selection.distance,
+        rejected_loops=np.flatnonzero(~selection.kept),
+        information_scale=selection.scale,
     )
 
 
 def _start_kept(
-    graph: PoseGraph, start: Transform, cost: float, iterations: int, reason: str, belief: Belief | None = None
+    graph: PoseGraph,
+    start: Transform,
+    cost: float,
+    iterations: int,
+    reason: str,
+    selection: LoopSelection | None = None,
 ) -> GraphSolution:
-    """The start itself as the solution, with what was found out about the loops."""
-    kept = np.ones(graph.num_loops, dtype=bool) if belief is None else belief.kept
+    """The start itself as the solution, with the evidence about the loops."""
+    kept = np.ones(graph.num_loops, dtype=bool) if selection is None else selection.kept
     return GraphSolution(
         world_from_node=start,
         cost_before=cost,
@@ -241,37 +249,41 @@ def _start_kept(
         stop_reason=reason,
         improved=False,
         loop_weights=kept.astype(np.float64),
-        loop_distances=np.full(graph.num_loops, np.nan) if belief is None else belief.distance,
+        loop_distances=np.full(graph.num_loops, np.nan) if selection is None else selection.distance,
         rejected_loops=np.flatnonzero(~kept),
-        information_scale=1.0 if belief is None else belief.scale,
+        information_scale=1.0 if selection is None else selection.scale,
     )
 
 
-def _believed(graph: PoseGraph, start: Transform, held: BoolArray, judge: Judge | None) -> Belief:
-    """The loops to keep, and a state near the minimum that they make."""
+def _select_loops(
+    graph: PoseGraph, start: Transform, held: BoolArray, inlier_test: LoopInlierTest | None
+) -> LoopSelection:
+    """The accepted loops, and a state near their minimum."""
     if graph.num_loops == 0:
-        return _believing_all(graph, start)
+        return _all_loops(graph, start)
     small = contract(graph, start, held)
-    belief = _by_parts(small.graph, start[small.nodes], held[small.nodes], judge)
+    selection = _by_parts(small.graph, start[small.nodes], held[small.nodes], inlier_test)
     seen: list[BoolArray] = []
     for _ in range(CONTRACTIONS):
-        belief = _settled(small.graph, belief, held[small.nodes], judge)
+        selection = _settled(small.graph, selection, held[small.nodes], inlier_test)
         try:
-            state = small.expand(belief.world_from_node)
+            state = small.expand(selection.world_from_node)
         except ValueError:  # contradictory loops can crumple a small graph beyond numbers
-            logger.warning("pose graph: the %d loops that seemed to agree have no common solution", belief.kept.sum())
-            return replace(belief, world_from_node=start)
-        belief = replace(belief, world_from_node=state)
-        if judge is None or belief.kept.all() or any((belief.kept == kept).all() for kept in seen):
+            logger.warning(
+                "pose graph: the %d loops that seemed to agree have no common solution", selection.kept.sum()
+            )
+            return replace(selection, world_from_node=start)
+        selection = replace(selection, world_from_node=state)
+        if inlier_test is None or selection.kept.all() or any((selection.kept == kept).all() for kept in seen):
             break
-        seen.append(belief.kept)
+        seen.append(selection.kept)
         small = contract(graph, state, held)
-        belief = replace(belief, world_from_node=state[small.nodes])
-    return belief
+        selection = replace(selection, world_from_node=state[small.nodes])
+    return selection
 
 
-def _believing_all(graph: PoseGraph, state: Transform) -> Belief:
-    return Belief(
+def _all_loops(graph: PoseGraph, state: Transform) -> LoopSelection:
+    return LoopSelection(
         world_from_node=state,
         kept=np.ones(graph.num_loops, dtype=bool),
         scale=1.0,
@@ -280,69 +292,77 @@ def _believing_all(graph: PoseGraph, state: Transform) -> Belief:
     )
 
 
-def _by_parts(graph: PoseGraph, start: Transform, held: BoolArray, judge: Judge | None) -> Belief:
-    """Linear parts, then translations, then both. Loops that the first refuse have no say in what follows."""
+def _by_parts(graph: PoseGraph, start: Transform, held: BoolArray, inlier_test: LoopInlierTest | None) -> LoopSelection:
+    """Linear parts, then translations, then both. Loops that the first step rejects take no part in the next."""
     group = type(start)
     part = linear_part(group)
     linear = part_of(graph, part, only_linear(graph.target_from_source))
     equations = NormalEquations(linear, held, part)
-    believing = _believing_all(graph, only_linear(start))
-    if judge is not None:
-        believing = _plausible(linear, believing, equations, held, judge)
-    belief = _annealed(linear, believing, equations, held, judge)
-    state = only_translation_of(start, belief.world_from_node)
+    first = _all_loops(graph, only_linear(start))
+    if inlier_test is not None:
+        first = _plausible(linear, first, equations, held, inlier_test)
+    selection = _annealed(linear, first, equations, held, inlier_test)
+    state = only_translation_of(start, selection.world_from_node)
     translation = part_of(graph, TRANSLATION, graph.target_from_source)
     equations = NormalEquations(translation, held, TRANSLATION)
-    state = descended(translation, state, equations, held, loop_weights_of(belief.kept)).world_from_node
-    return _annealed(graph, replace(belief, world_from_node=state), NormalEquations(graph, held), held, judge)
+    state = descended(translation, state, equations, held, loop_weights_of(selection.kept)).world_from_node
+    return _annealed(graph, replace(selection, world_from_node=state), NormalEquations(graph, held), held, inlier_test)
 
 
-def _plausible(graph: PoseGraph, belief: Belief, equations: NormalEquations, held: BoolArray, judge: Judge) -> Belief:
-    """The loops that the trusted edges alone allow; all of them where these allow none.
+def _plausible(
+    graph: PoseGraph, selection: LoopSelection, equations: NormalEquations, held: BoolArray, inlier_test: LoopInlierTest
+) -> LoopSelection:
+    """The loops that the odometry edges alone allow; all of them where these allow none.
 
-    No loop has a say here, so wrong loops that agree with each other cannot vouch for each other. If
-    none is allowed, the information of the trusted edges claims too much, and nothing can be said yet.
+    No loop has weight here, so false loops cannot support each other. If none passes, the information
+    of the odometry edges is too large, and the test is left to the next step.
     """
-    nobody = np.zeros(graph.num_loops, dtype=bool)
-    state = descended(graph, belief.world_from_node, equations, held, loop_weights_of(nobody)).world_from_node
-    seen = judge.judged(graph, state, equations, nobody)
-    return replace(belief, kept=seen.kept) if seen.kept.any() else belief
+    no_loop = np.zeros(graph.num_loops, dtype=bool)
+    state = descended(graph, selection.world_from_node, equations, held, loop_weights_of(no_loop)).world_from_node
+    tested = inlier_test.apply(graph, state, equations, no_loop)
+    return replace(selection, kept=tested.kept) if tested.kept.any() else selection
 
 
 def _annealed(
-    graph: PoseGraph, belief: Belief, equations: NormalEquations, held: BoolArray, judge: Judge | None
-) -> Belief:
-    weights = loop_weights_of(belief.kept)
-    state = descended(graph, belief.world_from_node, equations, held, weights).world_from_node
-    if judge is None:
-        return replace(belief, world_from_node=state)
-    return judge.anneal(graph, state, equations, held, weights)
+    graph: PoseGraph,
+    selection: LoopSelection,
+    equations: NormalEquations,
+    held: BoolArray,
+    inlier_test: LoopInlierTest | None,
+) -> LoopSelection:
+    weights = loop_weights_of(selection.kept)
+    state = descended(graph, selection.world_from_node, equations, held, weights).world_from_node
+    if inlier_test is None:
+        return replace(selection, world_from_node=state)
+    return inlier_test.anneal(graph, state, equations, held, weights)
 
 
-def _settled(graph: PoseGraph, belief: Belief, held: BoolArray, judge: Judge | None) -> Belief:
-    """Everything at once on a small graph, until no better choice of loops is in sight.
+def _settled(
+    graph: PoseGraph, selection: LoopSelection, held: BoolArray, inlier_test: LoopInlierTest | None
+) -> LoopSelection:
+    """Everything at once on a small graph, until no better selection of loops is found.
 
-    Better is what lowers the cost of the kept ones plus the threshold per rejected one.
+    Better is a lower cost of the accepted loops plus the threshold per rejected one.
     """
     equations = NormalEquations(graph, held)
-    kept, state, settled, lowest = belief.kept, belief.world_from_node, belief, np.inf
+    kept, state, settled, lowest = selection.kept, selection.world_from_node, selection, np.inf
     for _ in range(RECONSIDERATIONS):
         descent = descended(graph, state, equations, held, loop_weights_of(kept))
         state = descent.world_from_node
-        if judge is None:
-            return replace(belief, world_from_node=state)
-        seen = judge.judged(graph, state, equations, kept)
-        price = descent.cost + np.where(kept, 0.0, np.minimum(seen.threshold, seen.distance)).sum()
+        if inlier_test is None:
+            return replace(selection, world_from_node=state)
+        tested = inlier_test.apply(graph, state, equations, kept)
+        price = descent.cost + np.where(kept, 0.0, np.minimum(tested.threshold, tested.distance)).sum()
         if price >= lowest:
             break
-        lowest, settled = price, replace(seen, kept=kept)
-        if (seen.kept == kept).all():
+        lowest, settled = price, replace(tested, kept=kept)
+        if (tested.kept == kept).all():
             break
-        kept = seen.kept
+        kept = tested.kept
     return settled
 
 
-def _kernel_thresholds(graph: PoseGraph, belief: Belief, confidence: float) -> FloatArray:
+def _kernel_thresholds(graph: PoseGraph, selection: LoopSelection, confidence: float) -> FloatArray:
     """(L,) squared distance of a loop's own edges at which its weight is half.
 
     It is the quantile of the chi-squared distribution for all directions in which the loop's edges
@@ -351,7 +371,7 @@ def _kernel_thresholds(graph: PoseGraph, belief: Belief, confidence: float) -> F
     dof = graph.target_from_source.DOF
     edges = loop_sums(np.ones(len(graph)), graph.loop, graph.num_loops)
     freedom = dof * (edges - _own_nodes(graph))
-    limit: FloatArray = belief.scale * chdtri(np.maximum(freedom, dof), 1 - confidence)
+    limit: FloatArray = selection.scale * chdtri(np.maximum(freedom, dof), 1 - confidence)
     return limit
 
 
@@ -360,8 +380,8 @@ def _own_nodes(graph: PoseGraph) -> IntArray:
     ends = np.concatenate([graph.target, graph.source])
     loop = np.concatenate([graph.loop, graph.loop])
     lowest = np.full(graph.num_nodes, np.iinfo(np.int64).max)
-    highest = np.full(graph.num_nodes, TRUSTED)
+    highest = np.full(graph.num_nodes, ODOMETRY)
     np.minimum.at(lowest, ends, loop)
     np.maximum.at(highest, ends, loop)
-    own = (lowest == highest) & (highest != TRUSTED)
+    own = (lowest == highest) & (highest != ODOMETRY)
     return np.bincount(highest[own], minlength=graph.num_loops)
