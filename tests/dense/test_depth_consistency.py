@@ -21,7 +21,7 @@ from helpers.dense_scenes import (
     undistorted,
 )
 
-from smust3r_colmap.dense import depth_consistency as depth_consistency
+from smust3r_colmap.dense import depth_consistency
 from smust3r_colmap.dense.depth_consistency import ModelDepth, depth_of_model, sample_depth
 from smust3r_colmap.errors import InputError
 
@@ -227,7 +227,7 @@ def test_views_from_the_same_place_are_asked_last(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(depth_consistency, "CHECK_NEIGHBOURS", 2)
     xyz = np.random.default_rng(1).uniform([-1, -1, 4], [1, 1, 6], (50, 3))
     everything = np.arange(50)
-    sightings = depth_consistency._Sightings(
+    observations = depth_consistency._Observations(
         xyz=xyz,
         track_lengths=np.full(50, 4.0),
         points=dict.fromkeys((1, 2, 3, 4), everything) | {4: everything[:30]},
@@ -237,7 +237,7 @@ def test_views_from_the_same_place_are_asked_last(monkeypatch: pytest.MonkeyPatc
     views = {1: base}
     for i, x in ((2, 0.01), (3, 0.5), (4, -0.5)):
         views[i] = replace(base, cam_from_world=np.column_stack([np.eye(3), [-x, 0, 0]]))
-    assert depth_consistency._neighbours(sightings, views)[1] == [3, 4]
+    assert depth_consistency._neighbours(observations, views)[1] == [3, 4]
 
 
 def test_memory_for_neighbours_changes_nothing_but_time(
