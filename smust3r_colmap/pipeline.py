@@ -105,7 +105,7 @@ def reconstruct(
     output: Path,
     config: RunConfig,
     *,
-    fresh: bool = False,
+    overwrite: bool = False,
     reporter: Reporter,
     factory: BackboneFactory = make_backbone,
 ) -> RunSummary:
@@ -114,7 +114,7 @@ def reconstruct(
     Args:
         images: folder with the photographs, in the natural order of their names.
         output: made when missing; what an earlier run finished there is used.
-        fresh: start over instead.
+        overwrite: start over instead.
         reporter: told about every stage.
         factory: makes the backbone; by default the one that the configuration names.
 
@@ -128,9 +128,9 @@ def reconstruct(
     check_image_folder(images)
     with RunDirectory(output) as run:
         clock = StageClock(reporter)
-        scan, collection = _import(images, config, run, clock, fresh=fresh)
+        scan, collection = _import(images, config, run, clock, overwrite=overwrite)
         backbone = _backbone(factory, collection, config, run, clock)
-        begin_stages(run, scan, fresh=fresh)
+        begin_stages(run, scan, overwrite=overwrite)
         windows = plan_windows(
             len(collection), segment_length=config.segmentation.segment_length, overlap=config.segmentation.overlap
         )
@@ -154,11 +154,11 @@ def reconstruct(
 
 
 def _import(
-    images: Path, config: RunConfig, run: RunDirectory, clock: StageClock, *, fresh: bool
+    images: Path, config: RunConfig, run: RunDirectory, clock: StageClock, *, overwrite: bool
 ) -> tuple[FolderScan, ImageCollection]:
     """Read the folder, and change nothing in the run's."""
     with clock.stage("import", total=1) as stage:
-        scan = scan_changed_files(images, run, fresh=fresh, workers=config.workers)
+        scan = scan_changed_files(images, run, overwrite=overwrite, workers=config.workers)
         collection = collection_from_scan(scan, config.importing)
         if config.output.text:
             refuse_names_text_cannot_hold(image.name for image in collection.images)

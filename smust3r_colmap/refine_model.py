@@ -76,7 +76,7 @@ def refine_model(
     *,
     cameras: CameraChoice,
     pose_tolerance: float,
-    fresh: bool = False,
+    overwrite: bool = False,
     reporter: Reporter,
 ) -> RunSummary:
     """From a COLMAP model of poor poses to one with tracks in ``output/sparse/0``, and a database that goes with it.
@@ -90,7 +90,7 @@ def refine_model(
             and ``seed`` are used.
         cameras: what is to become of the cameras.
         pose_tolerance: how far from its epipolar line a match may lie at first, as a part of the longer image side.
-        fresh: start over.
+        overwrite: start over.
         reporter: told about every stage.
 
     Raises:
@@ -104,8 +104,8 @@ def refine_model(
     _refuse_to_overwrite(external.folder, output)
     with RunDirectory(output) as run:
         clock = StageClock(reporter)
-        scan, fitted = _fit(external, images, config, cameras, run, clock, fresh=fresh)
-        begin_stages(run, scan, fresh=fresh)
+        scan, fitted = _fit(external, images, config, cameras, run, clock, overwrite=overwrite)
+        begin_stages(run, scan, overwrite=overwrite)
         start = fitted.scene(origin=external.folder.name)
         features = _features(fitted, start, config, run, clock)
         refinement = _refine(fitted, start, features, config, run, clock, tolerance=pose_tolerance)
@@ -136,11 +136,11 @@ def _fit(
     run: RunDirectory,
     clock: StageClock,
     *,
-    fresh: bool,
+    overwrite: bool,
 ) -> tuple[FolderScan, FittedModel]:
     """Read the folder and hold the model against it; nothing in the run's folder changes."""
     with clock.stage("import", total=1) as stage:
-        scan = scan_changed_files(images, run, fresh=fresh, workers=config.workers)
+        scan = scan_changed_files(images, run, overwrite=overwrite, workers=config.workers)
         fitted = fit_to_images(
             external,
             scan,

@@ -22,7 +22,7 @@ class Reconstruct:
     """Folder of the result; made when missing."""
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None
     """Settings, such as segment_length = 40; flags override them."""
-    fresh: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Throw away what an earlier run left in OUT."""
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print warnings and errors only."""
@@ -36,6 +36,8 @@ def run_reconstruct(command: Reconstruct) -> int:
     from smust3r_colmap.pipeline import reconstruct  # noqa: PLC0415  (heavy: --help shall not pay for it)
 
     with reporting(quiet=command.quiet, verbose=command.verbose) as reporter:
-        summary = reconstruct(command.images, command.output, command.settings, fresh=command.fresh, reporter=reporter)
+        summary = reconstruct(
+            command.images, command.output, command.settings, overwrite=command.overwrite, reporter=reporter
+        )
         tell(summary, reporter, quiet=command.quiet)
         return summary.exit_code

@@ -67,7 +67,7 @@ class Refine:
     """Processes; 0 takes one per core that this process may use."""
     seed: int = 0
     """Of every random choice."""
-    fresh: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Throw away what an earlier run left in OUT."""
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print warnings and errors only."""
@@ -105,6 +105,6 @@ def run_refine(command: Refine, reporter: Reporter) -> RunSummary:
         command.run_config(),
         pose_tolerance=command.pose_tolerance,
         cameras=CameraChoice(share=command.share_cameras, model=command.camera_model, calibrated=command.calibrated),
-        fresh=command.fresh,
+        overwrite=command.overwrite,
         reporter=reporter,
     )

@@ -107,7 +107,7 @@ def open_database(path: Path) -> pycolmap.Database:
             if time.monotonic() > give_up_s:
                 raise StorageError(
                     f"{path}: cannot be opened for {_PATIENCE_S:.0f} s ({error}); is it held by another process, or "
-                    f"damaged? Delete {path.parent} or start with --fresh"
+                    f"damaged? Delete {path.parent} or start with --overwrite"
                 ) from error
             time.sleep(_PAUSE_S)
 

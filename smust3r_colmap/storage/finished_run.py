@@ -73,16 +73,16 @@ def write_finished(run: RunDirectory, finished: FinishedRun) -> None:
     write_json(run.work / FINISHED_FILE, facts)
 
 
-def begin_stages(run: RunDirectory, scan: FolderScan, *, fresh: bool) -> None:
+def begin_stages(run: RunDirectory, scan: FolderScan, *, overwrite: bool) -> None:
     """To be called before the stages change: until the run ends again, they do not belong together.
 
     And no earlier than the input is known to be of use, for until then the folder may hold a finished run.
 
     Args:
         scan: of the image folder.
-        fresh: throw away all that an earlier run left.
+        overwrite: throw away all that an earlier run left.
     """
-    if fresh:
+    if overwrite:
         run.start_over(MODEL_FILES)
     with storage_errors(run.work):
         (run.work / FINISHED_FILE).unlink(missing_ok=True)

@@ -8,11 +8,11 @@ from smust3r_colmap.importers.image_folder import FolderScan, ImportRecord, scan
 from smust3r_colmap.storage.run_directory import RunDirectory, StageFolder, key_of, read_json, write_json
 
 
-def scan_changed_files(images: Path, run: RunDirectory, *, fresh: bool, workers: int) -> FolderScan:
-    """Scan the folder; unless ``fresh``, files that did not change since an earlier start are not decoded again."""
+def scan_changed_files(images: Path, run: RunDirectory, *, overwrite: bool, workers: int) -> FolderScan:
+    """Scan the folder; unless ``overwrite``, files that did not change since an earlier start are not decoded again."""
     stored = _stage(run)
     known = {}
-    if stored.is_done and not fresh:
+    if stored.is_done and not overwrite:
         records = (ImportRecord.from_json(facts) for facts in read_json(stored.path / "records.json"))
         known = {record.name: record for record in records}
     return scan_image_folder(images, known=known, workers=workers)

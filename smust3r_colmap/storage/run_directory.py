@@ -253,7 +253,7 @@ def _damage_named(path: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, safetensors.SafetensorError) as error:
-        raise StorageError(f"{path}: is damaged ({error}); delete {path.parent} or start with --fresh") from error
+        raise StorageError(f"{path}: is damaged ({error}); delete {path.parent} or start with --overwrite") from error
 
 
 def _is_empty_folder(path: Path) -> bool:

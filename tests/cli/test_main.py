@@ -62,12 +62,12 @@ class _Call:
     def __init__(self, summary: RunSummary = GOOD) -> None:
         self.summary = summary
         self.config = RunConfig()
-        self.fresh = False
+        self.overwrite = False
 
     def __call__(
-        self, images: Path, output: Path, config: RunConfig, *, fresh: bool = False, reporter: Reporter
+        self, images: Path, output: Path, config: RunConfig, *, overwrite: bool = False, reporter: Reporter
     ) -> RunSummary:
-        self.images, self.output, self.config, self.fresh = images, output, config, fresh
+        self.images, self.output, self.config, self.overwrite = images, output, config, overwrite
         with reporter.stage("features", total=1) as stage:
             stage.advance()
         return self.summary
@@ -90,11 +90,11 @@ def test_good_run_exits_0_with_the_summary_on_stdout(
     call = _Call()
     put_pipeline(call)
 
-    assert cli.main([*RECONSTRUCT, "--fresh"]) == 0
+    assert cli.main([*RECONSTRUCT, "--overwrite"]) == 0
     out, err = capsys.readouterr()
     assert "5 of 5 images have a pose" in out
     assert "features" in err
-    assert (call.images, call.output, call.fresh) == (Path("photos"), Path("out"), True)
+    assert (call.images, call.output, call.overwrite) == (Path("photos"), Path("out"), True)
 
 
 REFINED = RefinementSummary(

@@ -226,5 +226,5 @@ def test_database_gives_keypoints_raw_and_verified_matches_by_image_index(world:
 def test_a_file_that_is_no_database_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("smust3r_colmap.features.sift._PATIENCE_S", 0.0)
     (tmp_path / "f.db").write_bytes(b"this is no database, whatever its name says" * 100)
-    with pytest.raises(StorageError, match=r"f\.db: cannot be opened.*damaged\? Delete .* or start with --fresh"):
+    with pytest.raises(StorageError, match=r"f\.db: cannot be opened.*damaged\? Delete .* or start with --overwrite"):
         read_matched_features(tmp_path / "f.db", range(3))

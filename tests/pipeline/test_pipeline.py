@@ -360,7 +360,7 @@ def test_an_output_among_the_images_is_refused(room: Path) -> None:
     assert not (room / "images/out").exists()
 
 
-@pytest.mark.parametrize("fresh", [False, True])
+@pytest.mark.parametrize("overwrite", [False, True])
 @pytest.mark.parametrize(
     ("images", "changes", "match"),
     [
@@ -374,7 +374,7 @@ def test_a_typing_error_costs_nothing_of_a_finished_run(
     images: str,
     changes: dict[str, Any],
     match: str,
-    fresh: bool,
+    overwrite: bool,
     brief: RunSummary,
     brief_walk: Path,
     tmp_path: Path,
@@ -387,7 +387,7 @@ def test_a_typing_error_costs_nothing_of_a_finished_run(
             brief_walk.parent / images,
             output,
             replace(BRIEF, **changes),
-            fresh=fresh,
+            overwrite=overwrite,
             reporter=QuietReporter(sys.stderr),
         )
     assert content(output) == before
@@ -404,7 +404,7 @@ def test_starting_over_uses_and_leaves_nothing_of_before(brief: RunSummary, brie
     shutil.copytree(brief.output, output)
     (output / "sparse/7").mkdir()
     shutil.copy(output / "sparse/0/cameras.bin", output / "sparse/7")
-    again = reconstruct(brief_walk, output, BRIEF, fresh=True, reporter=QuietReporter(sys.stderr))
+    again = reconstruct(brief_walk, output, BRIEF, overwrite=True, reporter=QuietReporter(sys.stderr))
     assert not any(reused(again).values())
     assert [path.name for path in (output / "sparse").iterdir()] == ["0"]
 

@@ -186,7 +186,7 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match=r"x\.safetensors"):
         read_arrays(tmp_path / "x.safetensors")
     (tmp_path / "half.json").write_text('{"a": ')
-    with pytest.raises(StorageError, match=r"half\.json: is damaged .*--fresh"):
+    with pytest.raises(StorageError, match=r"half\.json: is damaged .*--overwrite"):
         read_json(tmp_path / "half.json")
     with pytest.raises(StorageError, match=r"absent\.json"):
         read_json(tmp_path / "absent.json")

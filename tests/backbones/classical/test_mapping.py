@@ -538,7 +538,7 @@ def test_processes_that_open_the_database_at_the_same_moment_wait_for_each_other
 def test_a_file_that_is_no_database_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "database.db").write_bytes(b"garbage" * 1000)
     monkeypatch.setattr(features_module, "_PATIENCE_S", 0.1)
-    with pytest.raises(StorageError, match=r"database\.db: cannot be opened .* --fresh"):
+    with pytest.raises(StorageError, match=r"database\.db: cannot be opened .* --overwrite"):
         open_database(tmp_path / "database.db")
 
 
