@@ -98,11 +98,11 @@ def distance_after_alignment(found: pycolmap.Reconstruction, truth: FloatArray) 
 def test_the_page_has_a_snippet_in_every_section_that_promises_one(tmp_path: Path) -> None:
     headings = [snippet.heading for snippet in read_snippets(tmp_path)]
     assert headings == [
-        "Points anew",
+        "Triangulation",
         *["Bundle adjustment"] * 2,
         "Missing images",
-        *["The mapper from the start"] * 2,
-        *["Dense"] * 2,
+        *["Mapping"] * 2,
+        *["Dense reconstruction"] * 2,
     ]
 
 

@@ -229,7 +229,28 @@ def test_a_run_is_read_by_name_and_drawn(tmp_path: Path, monkeypatch: pytest.Mon
     with Image.open(picture) as opened:
         colours = {tuple(colour) for colour in np.asarray(opened.convert("RGB")).reshape(-1, 3)[::7].tolist()}
         assert opened.width > 800
-    assert any(blue > red + 50 for red, _, blue in colours)
+    assert any(red > blue + 50 for red, _, blue in colours)  # the path after loop closing
+
+
+def test_a_run_with_refinement_has_one_trajectory_more(tmp_path: Path) -> None:
+    scene = a_scene(5)
+    (tmp_path / "sparse").mkdir()
+    write_colmap_sparse(scene, tmp_path / "sparse" / "0", text=False)
+    for name in ("trajectory_tum.txt", "trajectory_stitched_tum.txt"):
+        write_tum(scene, tmp_path / name, None)
+    assert list(plot_trajectory.read_run(tmp_path)) == ["with loop closing", "with bundle adjustment"]
+    (tmp_path / "trajectory_stitched_tum.txt").unlink()
+    assert list(plot_trajectory.read_run(tmp_path)) == ["with loop closing"]
+    (tmp_path / "trajectory_tum.txt").unlink()
+    with pytest.raises(InputError, match=r"no trajectory_tum\.txt"):
+        plot_trajectory.read_run(tmp_path)
+
+
+def test_exaggerated_errors_grow_from_the_truth() -> None:
+    truth = {"a": np.zeros(3), "b": np.array([1.0, 0, 0])}
+    found = {"a": np.array([0, 0, 0.1]), "b": np.array([1.0, -0.2, 0]), "c": np.ones(3)}
+    np.testing.assert_allclose(plot_trajectory.exaggerated(found, truth, 10), [[0, 0, 1], [1, -2, 0]])
+    np.testing.assert_allclose(plot_trajectory.exaggerated(found, None, 10), list(found.values()))
 
 
 def test_a_trajectory_of_other_images_is_refused(tmp_path: Path) -> None:

@@ -50,6 +50,35 @@ def test_the_cloud_of_the_run_is_drawn_unless_another_is_named(
     assert pixels_of(fused, BLUE) == [above, side, seen]
 
 
+def test_the_overview_shows_cameras_and_what_faces_the_viewer(run: Path, tmp_path: Path) -> None:
+    """A floor that is red towards the sky and blue towards the ground, seen from above."""
+    model = pycolmap.Reconstruction(run / "sparse/0")
+    level_from_world = script.level_frame([model.image(i) for i in sorted(model.reg_image_ids())])
+    rng = np.random.default_rng(0)
+    floor = rng.uniform([-9, -0.01, -9], [9, 0.01, 9], (200_000, 3)) @ level_from_world
+    is_red = np.arange(len(floor)) % 2 == 0
+    rgb = np.where(is_red[:, None], RED, BLUE).astype(np.uint8)
+    normals = np.where(is_red[:, None], -level_from_world[1], level_from_world[1])  # the level frame has y down
+    write_ply(PointCloud(xyz=floor, rgb=rgb, normals=normals), tmp_path / "floor.ply")
+    picture = tmp_path / "overview.png"
+    assert script.main([str(run), str(picture), "--overview", "--cloud", str(tmp_path / "floor.ply")]) == 0
+    drawn = np.asarray(Image.open(picture).convert("RGB")).astype(int)
+    assert drawn.shape == (*script.OVERVIEW_PX[::-1], 3)
+    red, blue = ((np.abs(drawn - colour).max(axis=2) < 20).mean() for colour in (RED, BLUE))
+    assert red > 0.2
+    assert blue == 0
+    assert all((np.abs(drawn - colour).max(axis=2) < 40).any() for colour in (script.FIRST_RGB, script.LAST_RGB))
+    assert picture.stat().st_size < 200_000
+
+
+def test_strays_have_no_company() -> None:
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(0, 0.1, (50_000, 3)), [[1.0, 1.0, 1.0]]])
+    kept = script.has_company(points)
+    assert kept[:-1].mean() > 0.8
+    assert not kept[-1]
+
+
 def test_a_cloud_that_cannot_be_drawn_is_refused_by_name(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
