@@ -102,9 +102,9 @@ def test_the_cloud_lies_on_the_walls(finished: tuple[Path, int], found: Evaluati
 
 
 def test_the_lines_of_the_page_run_and_give_the_cameras(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """docs/backbones.md, "MUSt3R by itself"."""
-    page = (Path(__file__).resolve().parents[3] / "docs/backbones.md").read_text(encoding="utf-8")
-    section = page.partition("## MUSt3R by itself")[2]
+    """docs/using_must3r.md, "The network by itself"."""
+    page = (Path(__file__).resolve().parents[3] / "docs/using_must3r.md").read_text(encoding="utf-8")
+    section = page.partition("## The network by itself")[2]
     lines = re.search(r"```python\n(.*?)```", section, re.DOTALL)
     assert lines, "the page has no such lines"
     photos = sorted((room / "images").iterdir())[:12:3]
