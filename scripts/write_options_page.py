@@ -19,11 +19,13 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import tyro
 
-from smust3r_colmap.cli import Demo, Doctor, Reconstruct
-from smust3r_colmap.export_command import Export
-from smust3r_colmap.refine_command import Refine
-from smust3r_colmap.validate_command import Validate
-from smust3r_colmap.weights_command import ConvertWeights, FetchWeights, ListWeights, PathOfWeights, VerifyWeights
+from smust3r_colmap.cli.demo import Demo
+from smust3r_colmap.cli.export import Export
+from smust3r_colmap.cli.main import Doctor
+from smust3r_colmap.cli.reconstruct import Reconstruct
+from smust3r_colmap.cli.refine import Refine
+from smust3r_colmap.cli.validate import Validate
+from smust3r_colmap.cli.weights import ConvertWeights, FetchWeights, ListWeights, PathOfWeights, VerifyWeights
 
 PAGE = Path(__file__).resolve().parents[1] / "docs/options.md"
 
