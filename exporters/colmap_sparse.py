@@ -19,8 +19,8 @@ from smust3r_colmap.colmap.model_files import (
     refuse_names_text_cannot_hold,
     write_binary_checked,
 )
-from smust3r_colmap.exporters.atomic_write import replaced_folder
 from smust3r_colmap.products import Scene
+from smust3r_colmap.storage.atomic_write import atomic_folder
 
 
 def write_colmap_sparse(scene: Scene, folder: Path, *, text: bool = False) -> None:
@@ -39,7 +39,7 @@ def write_colmap_sparse(scene: Scene, folder: Path, *, text: bool = False) -> No
     if text:
         refuse_names_text_cannot_hold(scene.image_names)
     model = _reconstruction(scene)
-    with replaced_folder(folder, may_hold=MODEL_FILES) as partial:
+    with atomic_folder(folder, may_hold=MODEL_FILES) as partial:
         write_binary_checked(model, partial, to_be=folder)
         if text:
             model.write_text(partial)

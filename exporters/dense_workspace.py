@@ -36,10 +36,10 @@ from PIL import ExifTags, Image
 from smust3r_colmap.dense.depth_consistency import ModelDepth, depth_of_model
 from smust3r_colmap.errors import ImageError, InputError, ReconstructionError, StorageError
 from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks, usable_cores
-from smust3r_colmap.exporters.atomic_write import replaced_folder
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.importers.images import inspect, load_rgb
 from smust3r_colmap.products import DepthMaps, SourceImage
+from smust3r_colmap.storage.atomic_write import atomic_folder
 
 logger = logging.getLogger(__name__)
 
@@ -134,7 +134,7 @@ def write_dense_workspace(
     with_map = [source for source in sources if source.name in maps]
     if not with_map:
         raise InputError(f"no depth map for any of the {len(sources)} images of the model; make maps first")
-    with replaced_folder(folder, may_hold=WORKSPACE_ENTRIES) as partial:
+    with atomic_folder(folder, may_hold=WORKSPACE_ENTRIES) as partial:
         undistorted = _undistort(original, images, sources, partial, _longer_side(original, maps), log_file)
         place = {source.name: source.workspace_name for source in sources}
         written = [

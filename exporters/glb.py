@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from smust3r_colmap.exporters.atomic_write import replace_file
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import PointCloud, Scene
+from smust3r_colmap.storage.atomic_write import write_atomically
 
 FRUSTUM_PER_STEP = 0.6
 """Depth of a frustum over the usual distance of consecutive cameras: neighbours do not interleave."""
@@ -59,7 +59,7 @@ def write_glb(scene: Scene, path: Path, *, max_points: int = 1_000_000) -> None:
     if len(scene):
         cameras = _wire_cameras(scene, world_from_cam)
         document.add_geometry(cameras, geom_name="cameras", transform=gltf_from_geometry)
-    replace_file(path, document.export(file_type="glb"))  # type: ignore[no-untyped-call]
+    write_atomically(path, document.export(file_type="glb"))  # type: ignore[no-untyped-call]
 
 
 def frustum_depth(centres: FloatArray) -> float:

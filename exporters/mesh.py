@@ -30,9 +30,9 @@ from scipy.spatial import cKDTree
 
 from smust3r_colmap.errors import InputError, MissingDependencyError, ReconstructionError, advice_for
 from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks
-from smust3r_colmap.exporters.atomic_write import replace_file
 from smust3r_colmap.geometry.arrays import BoolArray, FloatArray, IntArray, UInt8Array
 from smust3r_colmap.geometry.camera import pixel_centres
+from smust3r_colmap.storage.atomic_write import write_atomically
 
 MIN_POINTS = 100
 """Fewer points of the cloud make no surface worth a file."""
@@ -158,10 +158,10 @@ def _make_mesh(task: _MeshTask) -> MeshReport | _NoOpen3D:
     if not len(mesh.faces):
         raise ReconstructionError("no face is left; the points are too few or too scattered")
     ply, glb = (task.workspace / f"mesh_{task.method}.{suffix}" for suffix in ("ply", "glb"))
-    replace_file(ply, _as_trimesh(mesh).export(file_type="ply"))
+    write_atomically(ply, _as_trimesh(mesh).export(file_type="ply"))
     chosen = _chosen_views(mesh, views)
     view_of_face = _best_views(mesh, chosen)
-    replace_file(glb, _as_glb(mesh, chosen, view_of_face))
+    write_atomically(glb, _as_glb(mesh, chosen, view_of_face))
     return MeshReport(
         ply=ply,
         glb=glb,

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.exporters.atomic_write import replace_file
 from smust3r_colmap.products import PointCloud
+from smust3r_colmap.storage.atomic_write import write_atomically
 
 FLOAT32_RELATIVE_STEP = 1e-6
 """Single precision is kept while its step at the farthest point is below this part of the extent."""
@@ -34,7 +34,7 @@ def write_ply(points: PointCloud, path: Path) -> None:
     rows = _structured(points)
     properties = "".join(f"property {_PLY_TYPES[rows.dtype[name].str]} {name}\n" for name in rows.dtype.names or ())
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{properties}end_header\n"
-    replace_file(path, header.encode("ascii") + rows.tobytes())
+    write_atomically(path, header.encode("ascii") + rows.tobytes())
 
 
 def _structured(points: PointCloud) -> npt.NDArray[Any]:

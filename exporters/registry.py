@@ -17,7 +17,6 @@ from smust3r_colmap.colmap.model_files import MODEL_FILES, refuse_names_text_can
 from smust3r_colmap.config import OutputConfig
 from smust3r_colmap.errors import InputError, MissingDependencyError, ReconstructionError
 from smust3r_colmap.execution.stage_clock import StageClock
-from smust3r_colmap.exporters.atomic_write import replaced_folder
 from smust3r_colmap.exporters.colmap_sparse import write_colmap_sparse
 from smust3r_colmap.exporters.dense_workspace import write_dense_workspace
 from smust3r_colmap.exporters.glb import write_glb
@@ -26,8 +25,8 @@ from smust3r_colmap.exporters.ply import write_ply
 from smust3r_colmap.exporters.trainer_folder import write_trainer_folder
 from smust3r_colmap.exporters.tum_trajectory import write_tum
 from smust3r_colmap.report.summary import MissingOutput
+from smust3r_colmap.storage.atomic_write import atomic_file, atomic_folder
 from smust3r_colmap.storage.finished_run import FinishedRun
-from smust3r_colmap.storage.run_directory import storage_errors
 
 TRAINER_FOLDER, DENSE_FOLDER, DATABASE_FILE = "trainer", "dense", "database.db"
 _NAMES_SHOWN = 3
@@ -115,7 +114,7 @@ def write_sparse(finished: FinishedRun, settings: FormatSettings) -> Written:
 
 def copy_model(model: Path, folder: Path, *, text: bool) -> None:
     """The binary files of a model to where they belong, and if wanted text made of them."""
-    with replaced_folder(folder, may_hold=MODEL_FILES) as partial:
+    with atomic_folder(folder, may_hold=MODEL_FILES) as partial:
         for path in sorted(model.glob("*.bin")):
             shutil.copyfile(path, partial / path.name)
         if text:
@@ -127,11 +126,8 @@ def write_database(finished: FinishedRun, settings: FormatSettings) -> Written:
     if finished.database is None:
         raise InputError("there is no database, for the run has no tracks; was it made with --no-refine?")
     target = finished.output / DATABASE_FILE
-    aside = target.with_name(f".{DATABASE_FILE}.partial")
-    with storage_errors(target):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(finished.database, aside)
-        aside.replace(target)
+    with atomic_file(target) as partial:
+        shutil.copyfile(finished.database, partial)
     return Written(name=DATABASE_FILE)
 
 

@@ -29,7 +29,6 @@ from scipy.spatial import cKDTree
 
 from smust3r_colmap.dense.depth_consistency import depth_of_model
 from smust3r_colmap.errors import InputError, StorageError
-from smust3r_colmap.exporters.atomic_write import replaced_folder
 from smust3r_colmap.exporters.centred_pinhole import CentredPinhole
 from smust3r_colmap.exporters.flat_names import flat_names
 from smust3r_colmap.exporters.inverse_depth import common_scale, inverse_depth_values
@@ -46,6 +45,7 @@ from smust3r_colmap.exporters.trainer_selection import LeftOut, Selection, neare
 from smust3r_colmap.exporters.transforms_json import points_saved, transforms_json
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.products import DepthMaps, PointCloud
+from smust3r_colmap.storage.atomic_write import atomic_folder
 
 logger = logging.getLogger(__name__)
 
@@ -130,7 +130,7 @@ def write_trainer_folder(
     points = _points(pinholes, selection, cloud)
     pixels = [(source, names[source.source.name]) for source in sources.values()]
 
-    with replaced_folder(folder, may_hold=_ours_in(folder)) as partial:
+    with atomic_folder(folder, may_hold=_ours_in(folder)) as partial:
         write_images(pixels, partial, scales)
         without_mask = () if masks is None else write_masks(pixels, masks, partial, scales)
         _write_model(pinholes, partial / "sparse" / "0")

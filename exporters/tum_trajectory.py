@@ -14,9 +14,9 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.errors import InputError
-from smust3r_colmap.exporters.atomic_write import replace_file
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import Scene
+from smust3r_colmap.storage.atomic_write import write_atomically
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world; x right, y down, z forward)"
 
@@ -47,7 +47,7 @@ def write_tum(scene: Scene, path: Path, timestamps_s: Sequence[float] | None) ->
         f"{time:.9f} " + " ".join(f"{value:.12g}" for value in (*centre, *quat))
         for time, centre, quat in zip(times[order], world_from_cam[:, :, 3], quat_xyzw, strict=True)
     ]
-    replace_file(path, ("\n".join([_HEADER, *lines]) + "\n").encode("ascii"))
+    write_atomically(path, ("\n".join([_HEADER, *lines]) + "\n").encode("ascii"))
 
 
 def continuous_quat_xyzw(rotations: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -39,7 +39,6 @@ from smust3r_colmap.errors import (
 from smust3r_colmap.execution.progress import Reporter
 from smust3r_colmap.execution.stage_clock import StageClock, peak_memory_bytes
 from smust3r_colmap.execution.task_pool import usable_cores
-from smust3r_colmap.exporters.atomic_write import replace_file
 from smust3r_colmap.exporters.registry import FORMATS, FormatSettings, Outputs, write_where_possible
 from smust3r_colmap.exporters.tum_trajectory import write_tum
 from smust3r_colmap.geometry.arrays import FloatArray
@@ -90,6 +89,7 @@ from smust3r_colmap.stitching.resection import PlacedSubmodel, place_submodel
 from smust3r_colmap.stitching.spanning_tree import ChainedPart
 from smust3r_colmap.stitching.stitch import Stitching, stitch
 from smust3r_colmap.storage.alignments import read_edges, write_edges
+from smust3r_colmap.storage.atomic_write import write_atomically
 from smust3r_colmap.storage.config_file import config_to_toml
 from smust3r_colmap.storage.depth_maps import DepthMapWriter, StoredDepthMaps
 from smust3r_colmap.storage.finished_run import FinishedRun, begin_stages, write_finished
@@ -532,7 +532,7 @@ def _export(
         write_tum(stitched.scenes[0], run.root / "trajectory_stitched_tum.txt", None)
         if unclosed is not None:
             write_tum(unclosed, run.root / "trajectory_without_loops_tum.txt", None)
-        replace_file(run.root / "config.toml", config_to_toml(config).encode())
+        write_atomically(run.root / "config.toml", config_to_toml(config).encode())
         write_finished(run, finished)
         stage.advance()
     large = config.output.large_formats if finished.database else ()

@@ -49,6 +49,7 @@ import safetensors.numpy
 from filelock import FileLock, Timeout
 
 from smust3r_colmap.errors import RunDirectoryError, RunLockedError, StorageError
+from smust3r_colmap.storage.atomic_write import write_atomically
 
 MODEL_FOLDER, DATABASE_FILE = "model", "database.db"
 
@@ -180,7 +181,7 @@ class StageFolder:
             _remove(aside)
             aside.mkdir(parents=True)
             yield aside
-            write_json(aside / _STAGE_FILE, {"key": self.key})
+            (aside / _STAGE_FILE).write_text(_json({"key": self.key}), encoding="utf-8")
             _remove(self.path)
             os.replace(aside, self.path)
 
@@ -201,14 +202,8 @@ def key_of(*parts: object) -> str:
 
 
 def write_json(path: Path, facts: object) -> None:
-    """Write ``facts`` aside and rename, so that the file is whole or absent."""
-    aside = path.with_name(path.name + ".partial")
-    with storage_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        aside.write_text(
-            json.dumps(facts, indent=1, default=_jsonable, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8"
-        )
-        os.replace(aside, path)
+    """Write ``facts`` as JSON, atomically."""
+    write_atomically(path, _json(facts).encode())
 
 
 def read_json(path: Path) -> Any:
@@ -274,6 +269,10 @@ def _hashable(value: object) -> object:
     if is_dataclass(value) and not isinstance(value, type):
         return {field.name: getattr(value, field.name) for field in fields(value)}
     return _jsonable(value)
+
+
+def _json(facts: object) -> str:
+    return json.dumps(facts, indent=1, default=_jsonable, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def _jsonable(value: object) -> object:

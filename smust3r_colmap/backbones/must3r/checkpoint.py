@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import argparse
 import logging
-import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
@@ -30,6 +29,7 @@ from smust3r_colmap.backbones.must3r.network import Network
 from smust3r_colmap.backbones.must3r.restricted_pickle import read_pickled
 from smust3r_colmap.backbones.must3r.state_dicts import StateDict, parts_for
 from smust3r_colmap.errors import CheckpointError, ConfigError, StorageError
+from smust3r_colmap.storage.atomic_write import atomic_file
 
 _log = logging.getLogger(__name__)
 
@@ -108,7 +108,7 @@ def convert_checkpoint(source: Path, target: Path) -> None:
 def write_safetensors_checkpoint(
     path: Path, architecture: Architecture, encoder_state: StateDict, decoder_state: StateDict
 ) -> None:
-    """Write weights in our form, aside first, so that the file is whole or as it was.
+    """Write weights in our form, atomically.
 
     Raises:
         ValueError: the state dicts are not those of the architecture.
@@ -120,18 +120,14 @@ def write_safetensors_checkpoint(
         for part, state in zip(_PARTS, (encoder_state, decoder_state), strict=True)
         for key, tensor in state.items()
     }
-    aside = path.with_name(f"{path.name}.partial-{os.getpid()}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        aside.touch()
-        usual_mode = aside.stat().st_mode  # safetensors would leave a file that only its owner can read
-        safetensors.torch.save_file(tensors, aside, {_ARCHITECTURE: architecture_to_json(architecture)})
-        aside.chmod(usual_mode)
-        os.replace(aside, path)
-    except (OSError, safetensors.SafetensorError) as error:
-        with suppress(OSError):
-            aside.unlink()
-        raise StorageError(f"{path} could not be written: {error}") from error
+    with atomic_file(path) as partial:
+        partial.touch()
+        usual_mode = partial.stat().st_mode  # safetensors would leave a file that only its owner can read
+        try:
+            safetensors.torch.save_file(tensors, partial, {_ARCHITECTURE: architecture_to_json(architecture)})
+        except safetensors.SafetensorError as error:  # also what it makes of an error of the disk
+            raise StorageError(f"{path}: cannot be written ({error})") from error
+        partial.chmod(usual_mode)
 
 
 # ------------------------------------------------------------------------------- reading

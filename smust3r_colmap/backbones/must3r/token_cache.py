@@ -1,7 +1,7 @@
 """Encoded images on disk, so that each is encoded once though segments overlap and loops come back to it.
 
 One file per image, its name from the image's content and from all that the features depend on. What is there is
-whole: files are written aside and renamed, and carry a checksum. What is not there, or is damaged, is encoded again,
+whole: writes are atomic, and files carry a checksum. What is not there, or is damaged, is encoded again,
 so nothing but time depends on this cache. One process writes to the folder: the one that holds the run
 directory. The drivers read a segment through ``TokenCache.images``.
 """
@@ -23,6 +23,8 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from smust3r_colmap.backbones.must3r.encoder import EncodedImage
+from smust3r_colmap.errors import StorageError
+from smust3r_colmap.storage.atomic_write import write_atomically
 
 _log = logging.getLogger(__name__)
 
@@ -90,20 +92,11 @@ class TokenCache:
             return
         self._sizes.pop(path.name, None)  # about to be replaced
         self._make_room_for(len(content))
-        aside = path.with_name(path.name + ".partial")
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            aside.write_bytes(content)
-            os.replace(aside, path)
-        except OSError as error:
+            write_atomically(path, content)
+        except StorageError as error:
             self._takes_more = False
-            with suppress(OSError):
-                aside.unlink()
-            _log.warning(
-                "%s: %s; no more encoded images are kept there. The run goes on, and encodes again what it needs twice",
-                self._folder,
-                error.strerror or error,
-            )
+            _log.warning("%s; from now on encoded images are not cached, and encoded again when needed twice", error)
             return
         self._sizes[path.name] = len(content)
 
