@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import write_options_page
 from helpers.finished_runs import Example
+from helpers.summaries import GOOD
 from PIL import Image
 
 from smust3r_colmap.cli.main import main, parse
@@ -145,6 +146,12 @@ def test_the_settings_file_of_the_options_page_is_read(tmp_path: Path) -> None:
     assert found
     (tmp_path / "config.toml").write_text(found[1])
     assert read_settings(tmp_path / "config.toml") == {"segment_length": 40, "overlap": 20, "camera_mode": "single"}
+
+
+def test_the_keys_of_the_summary_are_those_of_the_page() -> None:
+    rows = re.findall(r"^\| (`.*?) \|", text_of(ROOT / "docs/outputs.md").partition("## The summary")[2], re.M)
+    keys = {key for row in rows for key in re.findall(r"`(\w+)`", row)}
+    assert keys == GOOD.to_json_dict().keys() | {"model_notes", "settings"}
 
 
 # --------------------------------------------------------------------------------- pages
