@@ -15,9 +15,9 @@ import pycolmap
 
 from smust3r_colmap.colmap.model_files import (
     MODEL_FILES,
-    _refuse_truncated_text,
     refuse_names_text_cannot_hold,
     write_binary_checked,
+    write_text_checked,
 )
 from smust3r_colmap.products import Scene
 from smust3r_colmap.storage.atomic_write import atomic_folder
@@ -28,7 +28,7 @@ def write_colmap_sparse(scene: Scene, folder: Path, *, text: bool = False) -> No
 
     Args:
         scene: one connected model.
-        folder: such as ``sparse/0``; written aside and renamed when complete.
+        folder: such as ``sparse/0``; written atomically.
         text: write ``.txt`` beside the ``.bin`` files.
 
     Raises:
@@ -42,8 +42,7 @@ def write_colmap_sparse(scene: Scene, folder: Path, *, text: bool = False) -> No
     with atomic_folder(folder, may_hold=MODEL_FILES) as partial:
         write_binary_checked(model, partial, to_be=folder)
         if text:
-            model.write_text(partial)
-            _refuse_truncated_text(scene, partial, folder)
+            write_text_checked(model, partial, to_be=folder)
 
 
 def _reconstruction(scene: Scene) -> pycolmap.Reconstruction:

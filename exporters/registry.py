@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pycolmap
 
-from smust3r_colmap.colmap.model_files import MODEL_FILES, refuse_names_text_cannot_hold
+from smust3r_colmap.colmap.model_files import MODEL_FILES, refuse_names_text_cannot_hold, write_text_checked
 from smust3r_colmap.config import OutputConfig
 from smust3r_colmap.errors import InputError, MissingDependencyError, ReconstructionError
 from smust3r_colmap.execution.stage_clock import StageClock
@@ -118,7 +118,7 @@ def copy_model(model: Path, folder: Path, *, text: bool) -> None:
         for path in sorted(model.glob("*.bin")):
             shutil.copyfile(path, partial / path.name)
         if text:
-            pycolmap.Reconstruction(model).write_text(partial)
+            write_text_checked(pycolmap.Reconstruction(model), partial, to_be=folder)
 
 
 def write_database(finished: FinishedRun, settings: FormatSettings) -> Written:

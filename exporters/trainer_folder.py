@@ -27,8 +27,9 @@ import numpy as np
 import pycolmap
 from scipy.spatial import cKDTree
 
+from smust3r_colmap.colmap.model_files import write_binary_checked
 from smust3r_colmap.dense.depth_consistency import depth_of_model
-from smust3r_colmap.errors import InputError, StorageError
+from smust3r_colmap.errors import InputError
 from smust3r_colmap.exporters.centred_pinhole import CentredPinhole
 from smust3r_colmap.exporters.flat_names import flat_names
 from smust3r_colmap.exporters.inverse_depth import common_scale, inverse_depth_values
@@ -133,8 +134,10 @@ def write_trainer_folder(
     with atomic_folder(folder, may_hold=_ours_in(folder)) as partial:
         write_images(pixels, partial, scales)
         without_mask = () if masks is None else write_masks(pixels, masks, partial, scales)
-        _write_model(pinholes, partial / "sparse" / "0")
-        write_ply(points, partial / "sparse" / "0" / "points3D.ply")
+        sparse = partial / "sparse" / "0"
+        sparse.mkdir(parents=True)
+        write_binary_checked(pinholes, sparse, to_be=folder / "sparse" / "0")
+        write_ply(points, sparse / "points3D.ply")
         scale = common_scale(selection.observations.depth)
         without_depth = () if maps is None else _write_depths(model, pinholes, maps, scale, partial)
         mask_of = None if masks is None else {name: f"masks/{_stem(name)}.png" for name in names.values()}
@@ -213,26 +216,6 @@ def _pinhole_model(
         pinholes.add_point3D(xyz, track, rgb)
     pinholes.update_point_3d_errors()
     return pinholes
-
-
-def _write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Binary, and every byte there: pycolmap stays silent when the disk is full.
-
-    The sizes follow from COLMAP's public format: a count of 8 bytes, then per camera 24 bytes and its parameters,
-    per image 73 and its name and 24 per observation, per point 51 and 8 per observation.
-    """
-    folder.mkdir(parents=True)
-    model.write_binary(folder)
-    tracks = sum(point.track.length() for point in model.points3D.values())
-    expected = {
-        "cameras.bin": 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values()),
-        "images.bin": 8 + sum(73 + len(image.name.encode()) for image in model.images.values()) + 24 * tracks,
-        "points3D.bin": 8 + 51 * model.num_points3D() + 8 * tracks,
-    }
-    for name, size in expected.items():
-        found = (folder / name).stat().st_size
-        if found != size:
-            raise StorageError(f"{folder / name}: {found} of {size} bytes arrived; is the disk full?")
 
 
 def _points(pinholes: pycolmap.Reconstruction, selection: Selection, cloud: PointCloud | None) -> PointCloud:

@@ -10,7 +10,7 @@ The next module to read is ``trainer_folder``.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -46,13 +46,11 @@ def write_colmap_database(
         matches: verified, by pair (i, j) of image indices.
         j_from_i: (3, 4) relative poses of the pairs that have one, written with their essential matrices.
         priors: of camera positions, with ids of the model.
-
-    Source: order of the calls as COLMAP 4 wants it (frames after images, images without a frame id).
     """
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
-        write_cameras(database, cameras)
-        for index, image in enumerate(collection.images):
-            _write_image(database, index, image.name, image.camera)
+        indices = [(index, image.camera) for index, image in enumerate(collection.images)]
+        write_images(database, cameras, indices, name_of=lambda index: collection.images[index].name)
+        for index, _ in indices:
             points = keypoints.get(index, np.empty((0, 2), np.float32))
             database.write_keypoints(index + 1, np.ascontiguousarray(points))
         for (i, j), rows in matches.items():
@@ -60,24 +58,6 @@ def write_colmap_database(
             database.write_two_view_geometry(i + 1, j + 1, _two_view_geometry(rows, j_from_i.get((i, j))))
         for prior in priors:
             database.write_pose_prior(prior, use_pose_prior_id=True)
-
-
-def write_cameras(database: pycolmap.Database, cameras: Sequence[Intrinsics]) -> None:
-    """Each camera and the rig that consists of it; ids are index + 1."""
-    for index, intrinsics in enumerate(cameras):
-        camera = intrinsics.colmap_camera(index + 1)
-        database.write_camera(camera, use_camera_id=True)
-        rig = pycolmap.Rig(rig_id=index + 1)
-        rig.add_ref_sensor(camera.sensor_id)
-        database.write_rig(rig, use_rig_id=True)
-
-
-def _write_image(database: pycolmap.Database, index: int, name: str, camera: int) -> None:
-    image = pycolmap.Image(name=name, camera_id=camera + 1, image_id=index + 1)
-    database.write_image(image, use_image_id=True)
-    frame = pycolmap.Frame(frame_id=index + 1, rig_id=camera + 1)
-    frame.add_data_id(image.data_id)
-    database.write_frame(frame, use_frame_id=True)
 
 
 def _two_view_geometry(matches: npt.NDArray[np.uint32], j_from_i: FloatArray | None) -> pycolmap.TwoViewGeometry:
@@ -122,11 +102,29 @@ def create_database(path: Path, collection: ImageCollection) -> None:
             write_images(database, collection.cameras, [(i, image.camera) for i, image in enumerate(collection.images)])
 
 
-def write_images(database: pycolmap.Database, cameras: Sequence[Intrinsics], images: Iterable[tuple[int, int]]) -> None:
-    """Write all ``cameras`` and the images given as (index, camera index), one rig and frame each.
+def internal_name(index: int) -> str:
+    """The name of an image in the databases inside a run.
 
-    Inside the run an image goes by its number: pycolmap's lists of pairs are text and would cut
-    names at the first blank.
+    It is a number, because pycolmap's lists of pairs are text and would cut a name at the first blank.
+    """
+    return f"{index:08d}"
+
+
+def write_images(
+    database: pycolmap.Database,
+    cameras: Sequence[Intrinsics],
+    images: Iterable[tuple[int, int]],
+    *,
+    name_of: Callable[[int], str] = internal_name,
+) -> None:
+    """Write all cameras and some images; each camera is a rig, each image a frame, ids are index + 1.
+
+    Args:
+        cameras: by camera index.
+        images: as (index, camera index).
+        name_of: the name of an image by its index.
+
+    Source: order of the calls as COLMAP 4 wants it (frames after images, images without a frame id).
     """
     for index, intrinsics in enumerate(cameras):
         camera = intrinsics.colmap_camera(index + 1)
@@ -135,13 +133,8 @@ def write_images(database: pycolmap.Database, cameras: Sequence[Intrinsics], ima
         rig.add_ref_sensor(camera.sensor_id)
         database.write_rig(rig, use_rig_id=True)
     for index, camera_index in images:
-        image = pycolmap.Image(name=internal_name(index), camera_id=camera_index + 1, image_id=index + 1)
+        image = pycolmap.Image(name=name_of(index), camera_id=camera_index + 1, image_id=index + 1)
         database.write_image(image, use_image_id=True)
         frame = pycolmap.Frame(frame_id=index + 1, rig_id=camera_index + 1)
         frame.add_data_id(image.data_id)
         database.write_frame(frame, use_frame_id=True)
-
-
-def internal_name(index: int) -> str:
-    """The name of an image in the databases of a run."""
-    return f"{index:08d}"

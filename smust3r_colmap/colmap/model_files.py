@@ -8,7 +8,6 @@ from pathlib import Path
 import pycolmap
 
 from smust3r_colmap.errors import InputError, StorageError
-from smust3r_colmap.products import Scene
 
 MODEL_FILES = frozenset(
     f"{name}.{suffix}" for name in ("rigs", "cameras", "frames", "images", "points3D") for suffix in ("bin", "txt")
@@ -35,7 +34,8 @@ def write_binary_checked(model: pycolmap.Reconstruction, folder: Path, *, to_be:
 
     Args:
         model: any model.
-        folder: where the files are written. to_be: where they will stand, for the message.
+        folder: where the files are written.
+        to_be: where they will be later, for the message.
 
     Raises:
         StorageError: less arrived than was written.
@@ -56,9 +56,20 @@ def write_binary_checked(model: pycolmap.Reconstruction, folder: Path, *, to_be:
         _refuse_less(to_be or folder, name, (folder / name).stat().st_size, count, "bytes")
 
 
-def _refuse_truncated_text(scene: Scene, partial: Path, folder: Path) -> None:
-    for name, count in {"images.txt": 2 * len(scene), "points3D.txt": len(scene.points)}.items():
-        _refuse_less(folder, name, _count_lines(partial / name), count, "lines")
+def write_text_checked(model: pycolmap.Reconstruction, folder: Path, *, to_be: Path | None = None) -> None:
+    """Write the ``.txt`` files into a folder that exists, and count what arrived.
+
+    Args:
+        model: any model whose names have no blanks.
+        folder: where the files are written.
+        to_be: where they will be later, for the message.
+
+    Raises:
+        StorageError: less arrived than was written.
+    """
+    model.write_text(folder)
+    for name, count in {"images.txt": 2 * model.num_reg_images(), "points3D.txt": model.num_points3D()}.items():
+        _refuse_less(to_be or folder, name, _count_lines(folder / name), count, "lines")
 
 
 def _refuse_less(folder: Path, name: str, found: int, expected: int, unit: str) -> None:

@@ -761,7 +761,7 @@ def test_failed_write_leaves_what_was_there(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(safetensors.torch, "save_file", refuse)
-    with pytest.raises(StorageError, match=r"ours\.safetensors cannot be written \(No space left"):
+    with pytest.raises(StorageError, match=r"ours\.safetensors: cannot be written \(No space left"):
         convert_checkpoint(tmp_path / "weights.pth", target)
     assert target.read_bytes() == before and len(list(target.parent.iterdir())) == 1
 
