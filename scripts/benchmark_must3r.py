@@ -75,12 +75,12 @@ from smust3r_colmap.backbones.must3r.memory_plan import MemoryModel, memory_budg
 from smust3r_colmap.backbones.must3r.network import init_memory
 from smust3r_colmap.backbones.must3r.precision import choose_device, choose_precision, prepare
 from smust3r_colmap.backbones.must3r.preprocessing import NetworkImage, preprocess
-from smust3r_colmap.backbones.must3r.recipe import recipe_weights
 from smust3r_colmap.config import CameraFit, Device, ImportConfig, Precision
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.importers.image_folder import import_image_folder
 from smust3r_colmap.importers.images import load_rgb
 from smust3r_colmap.products import ImageCollection
+from smust3r_colmap.synthetic.must3r_weights import random_network_weights
 from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
 
 STAGES = ("preprocess", "encode", "add", "render", "cameras", "maps")
@@ -532,7 +532,7 @@ def architecture_of(name: str, size: int) -> Architecture:
 
 def write_random_weights(path: Path, architecture: Architecture) -> None:
     """In our own form, which is mapped into memory as the backbone would map it."""
-    network = recipe_weights(architecture, SEED)
+    network = random_network_weights(architecture, SEED)
     write_safetensors_checkpoint(path, architecture, network.encoder.state_dict(), network.decoder.state_dict())
 
 

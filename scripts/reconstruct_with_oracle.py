@@ -70,7 +70,7 @@ def main(words: Sequence[str] | None = None) -> int:
             arguments.output,
             config,
             reporter=reporter_for(sys.stderr, quiet=False),
-            factory=oracle_factory(arguments.data),
+            factory=oracle_factory(arguments.data, arguments.preset),
         )
     except SmustrError as error:
         print(error, file=sys.stderr)
@@ -153,12 +153,12 @@ def is_plain_folder(path: Path) -> bool:
 
 
 # ------------------------------------------------------------------------------- oracle
-def oracle_factory(data: Path) -> BackboneFactory:
-    """What makes the oracle of a data set, for the images of the run and with the preset of its options."""
+def oracle_factory(data: Path, preset: str) -> BackboneFactory:
+    """What makes the oracle of a data set for the images of the run."""
 
     def make_oracle(context: BackboneContext) -> OracleBackbone:
         truth = colour_scene(data, [image.name for image in context.collection.images])
-        return OracleBackbone(truth, context.collection, PRESETS[context.options["preset"]], context.config.seed)
+        return OracleBackbone(truth, context.collection, PRESETS[preset], context.config.seed)
 
     return make_oracle
 

@@ -26,7 +26,7 @@ import pycolmap
 from smust3r_colmap.alignment.pairwise import align_submodels, candidate_pairs, needs_maps
 from smust3r_colmap.backbones.base import Backbone, BackboneContext, BackboneFactory, BackboneResult
 from smust3r_colmap.backbones.masked_maps import without_masked_depth
-from smust3r_colmap.backbones.registry import make_backbone, read_options
+from smust3r_colmap.backbones.registry import make_backbone
 from smust3r_colmap.colmap.model_files import MODEL_FILES, refuse_names_text_cannot_hold
 from smust3r_colmap.config import RunConfig
 from smust3r_colmap.dense.depth_consistency import depth_scales
@@ -186,7 +186,6 @@ def _backbone(
         BackboneContext(
             collection=collection,
             config=config,
-            options=read_options(config.backbone_options),
             run=run,
             reporter=clock,
             workers=config.workers or usable_cores(),

@@ -6,9 +6,9 @@ predictions on disk and turns them into submodels.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -87,8 +87,7 @@ class BackboneContext:
 
     Args:
         collection: the images of the run.
-        config: every setting; ``options`` are those that only the backbone understands.
-        options: what ``--backbone-options`` says.
+        config: every setting.
         run: where finished work is kept.
         reporter: told about every stage.
         workers: processes or threads that may run at once, at least one.
@@ -96,20 +95,31 @@ class BackboneContext:
 
     collection: ImageCollection
     config: RunConfig
-    options: Mapping[str, str]
     run: RunDirectory
     reporter: Reporter
     workers: int
 
 
-class BackboneFactory(Protocol):
-    """What an entry point of the group ``smust3r_colmap.backbones`` names: a class or a function."""
+BackboneFactory = Callable[[BackboneContext], Backbone]
+"""Makes the backbone of one run.
 
-    def __call__(self, context: BackboneContext) -> Backbone:
-        """The backbone of one run.
+Raises:
+    ConfigError: a setting or an option makes no sense.
+    MissingDependencyError: a package is not installed.
+    CheckpointError: the weights cannot be used.
+"""
 
-        Raises:
-            ConfigError: a setting or an option makes no sense.
-            MissingDependencyError: a package is not installed.
-            CheckpointError: the weights cannot be used.
-        """
+OptionsT = TypeVar("OptionsT")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackbonePlugin(Generic[OptionsT]):
+    """What an entry point of the group ``smust3r_colmap.backbones`` names.
+
+    Args:
+        make: the backbone of one run, from its context and its options. Raises what ``BackboneFactory`` raises.
+        options: dataclass of its ``--backbone-options``; see ``options.parse_options`` for the types of its fields.
+    """
+
+    make: Callable[[BackboneContext, OptionsT], Backbone]
+    options: type[OptionsT]

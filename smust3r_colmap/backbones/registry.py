@@ -1,45 +1,46 @@
 """Backbones by name: ours, and those that other packages register as entry points.
 
-A package adds one with an entry point in the group ``smust3r_colmap.backbones`` that names a
-``BackboneFactory``; docs/backbones.md shows how. Nothing is imported before it is asked for.
+A package adds one with an entry point in the group ``smust3r_colmap.backbones`` that names a ``BackbonePlugin``;
+docs/backbones.md shows how. Nothing is imported before it is asked for. The next module to read is ``feed_forward``.
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any
 
+from smust3r_colmap.backbones.options import parse_options
 from smust3r_colmap.errors import ConfigError, MissingDependencyError
 
 if TYPE_CHECKING:  # so that the names can be listed where numpy or pycolmap are broken
-    from smust3r_colmap.backbones.base import Backbone, BackboneContext, BackboneFactory
+    from smust3r_colmap.backbones.base import Backbone, BackboneContext, BackbonePlugin
 
 ENTRY_POINT_GROUP = "smust3r_colmap.backbones"
 OUR_PACKAGE = "smust3r-colmap"
 
 BUILT_IN: Mapping[str, str] = {
-    "classical": "smust3r_colmap.backbones.classical.backbone:make_classical",
-    "must3r": "smust3r_colmap.backbones.must3r.backbone:make_must3r",
-    "vggt": "smust3r_colmap.backbones.vggt:make_vggt",
+    "classical": "smust3r_colmap.backbones.classical.backbone:CLASSICAL",
+    "must3r": "smust3r_colmap.backbones.must3r.backbone:MUST3R",
+    "vggt": "smust3r_colmap.backbones.vggt:VGGT",
 }
-"""Module and function of each factory of this package."""
+"""Module and plug-in of each backbone of this package."""
 
 _BROKEN_MODULE = (OSError, SyntaxError, NameError, AttributeError, TypeError, ValueError, RuntimeError)
-"""What somebody else's module has been seen to raise while it is imported, besides ImportError."""
+"""What a foreign module may raise on import besides ImportError."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class KnownBackbone:
-    """A backbone that can be asked for, which does not mean that it works.
+    """A registered backbone; it may not work.
 
     Args:
         name: after ``--backbone``.
-        package: that brings it.
-        target: ``module:attribute`` of its factory.
+        package: that registers it.
+        target: ``module:attribute`` of its ``BackbonePlugin``.
     """
 
     name: str
@@ -48,7 +49,7 @@ class KnownBackbone:
 
 
 def list_backbones() -> tuple[KnownBackbone, ...]:
-    """Ours, then those of other packages by name; a name that is claimed twice stands there twice."""
+    """Ours, then those of other packages by name; a name that two packages register is listed twice."""
     ours = [KnownBackbone(name=name, package=OUR_PACKAGE, target=target) for name, target in BUILT_IN.items()]
     theirs = [
         KnownBackbone(name=entry.name, package=entry.dist.name if entry.dist else "unknown", target=entry.value)
@@ -64,24 +65,22 @@ def make_backbone(context: BackboneContext) -> Backbone:
         context: of the run.
 
     Raises:
-        ConfigError: the name is not known or claimed twice, its package is broken, or an option is not known.
+        ConfigError: the name is unknown or registered twice, its package is broken, or an option makes no sense.
         MissingDependencyError: a package that it needs is not installed.
         CheckpointError: its weights cannot be used.
     """
     known = find_backbone(context.config.backbone)
-    factory = _imported(known)
-    options = _WatchedOptions(context.options)
-    made = factory(replace(context, options=options))
-    _refuse_unread(options, known)
+    plugin = load_plugin(known)
+    made = plugin.make(context, parse_options(context.config.backbone_options, plugin.options, known.name))
     _refuse_incomplete(made, known)
     return made
 
 
 def find_backbone(name: str) -> KnownBackbone:
-    """Who brings the backbone of this name.
+    """The backbone of this name.
 
     Raises:
-        ConfigError: nobody does, or more than one package.
+        ConfigError: no package registers it, or more than one.
     """
     known = list_backbones()
     claims = [one for one in known if one.name == name]
@@ -96,34 +95,15 @@ def find_backbone(name: str) -> KnownBackbone:
     return claims[0]
 
 
-def load_factory(name: str) -> BackboneFactory:
-    """Import the factory of a backbone, and nothing more.
+def load_plugin(known: KnownBackbone) -> BackbonePlugin[Any]:
+    """Import a backbone, and nothing more.
 
     Raises:
-        ConfigError: as ``find_backbone``, or what was registered is no factory.
+        ConfigError: its module is broken, or what was registered is no ``BackbonePlugin``.
         MissingDependencyError: its module, or one that it imports, is not installed.
     """
-    return _imported(find_backbone(name))
+    from smust3r_colmap.backbones.base import BackbonePlugin  # noqa: PLC0415  (needs numpy)
 
-
-def read_options(text: str) -> dict[str, str]:
-    """``"a=b,c=d"`` as ``{"a": "b", "c": "d"}``; a value may hold ``=``, but no comma.
-
-    Raises:
-        ConfigError: a part has no name or no ``=``, or a name comes twice.
-    """
-    options: dict[str, str] = {}
-    for part in (part.strip() for part in text.split(",") if part.strip()):
-        name, equals, value = (word.strip() for word in part.partition("="))
-        if not equals or not name:
-            raise ConfigError(f"--backbone-options: {part!r} is not name=value (a value cannot hold a comma)")
-        if name in options:
-            raise ConfigError(f"--backbone-options: {name} is given twice, as {options[name]!r} and {value!r}")
-        options[name] = value
-    return options
-
-
-def _imported(known: KnownBackbone) -> BackboneFactory:
     module, _, attribute = known.target.partition(":")
     where = f"backbone {known.name} of the package {known.package} ({known.target})"
     try:
@@ -134,35 +114,9 @@ def _imported(known: KnownBackbone) -> BackboneFactory:
         raise MissingDependencyError(f"{where} cannot be imported: {error}; install what is missing") from error
     except _BROKEN_MODULE as error:
         raise ConfigError(f"{where} is broken: {type(error).__name__}: {error}; tell its authors") from error
-    if not callable(found):
-        raise ConfigError(f"{where}: is a {type(found).__name__}, needed a function or class that takes the context")
-    return cast("BackboneFactory", found)
-
-
-# ------------------------------------------------------------------------------ what a factory did
-class _WatchedOptions(Mapping[str, str]):
-    """Options that remember which names were asked for, so that a misspelt one does not pass in silence."""
-
-    def __init__(self, options: Mapping[str, str]) -> None:
-        self._options = options
-        self.asked: set[str] = set()
-
-    def __getitem__(self, name: str) -> str:
-        self.asked.add(name)
-        return self._options[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._options)
-
-    def __len__(self) -> int:
-        return len(self._options)
-
-
-def _refuse_unread(options: _WatchedOptions, known: KnownBackbone) -> None:
-    unread = sorted(set(options) - options.asked)
-    if unread:
-        takes = f"knows {', '.join(sorted(options.asked))}" if options.asked else "takes no options"
-        raise ConfigError(f"--backbone-options {', '.join(unread)}: the backbone {known.name} {takes}")
+    if not isinstance(found, BackbonePlugin):
+        raise ConfigError(f"{where}: is a {type(found).__name__}, needed a BackbonePlugin; see docs/backbones.md")
+    return found
 
 
 def _refuse_incomplete(made: object, known: KnownBackbone) -> None:
@@ -176,6 +130,6 @@ def _refuse_incomplete(made: object, known: KnownBackbone) -> None:
     lacking = [name for name, is_right in wanted.items() if not is_right(getattr(made, name, None))]
     if lacking:
         raise ConfigError(
-            f"backbone {known.name} of the package {known.package}: its factory gave a {type(made).__name__} "
+            f"backbone {known.name} of the package {known.package}: made a {type(made).__name__} "
             f"without {', '.join(lacking)}; see docs/backbones.md"
         )

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -24,7 +24,7 @@ import safetensors
 import safetensors.torch
 import torch
 
-from smust3r_colmap.backbones.base import BackboneContext
+from smust3r_colmap.backbones.base import BackboneContext, BackbonePlugin
 from smust3r_colmap.backbones.feed_forward import (
     FeedForwardBackbone,
     PredictedImage,
@@ -42,6 +42,7 @@ from smust3r_colmap.storage.dense_maps import ImageMaps
 PATCH_PX = 14
 """Sides of the network's input are multiples of it."""
 TRAINED_WIDTH_PX = 518
+Device = Literal["auto", "cpu", "cuda"]
 SURE_CONFIDENCE = 1.5
 """The authors' lower end of useful thresholds; 1 is none, as in our maps."""
 LEAST_SURE_SHARE = 0.05
@@ -128,37 +129,51 @@ class _Loaded:
     fast_type: torch.dtype | None
 
 
-def make_vggt(context: BackboneContext) -> FeedForwardBackbone:
-    """The factory that the registry knows.
+@dataclass(frozen=True, kw_only=True)
+class VggtOptions:
+    """After ``--backbone-options``.
 
-    Options: ``checkpoint`` (a file, needed), ``size`` (width in the network, 518), ``device`` (auto, cpu or cuda).
+    Args:
+        checkpoint: weights as the authors publish them; needed.
+        size: width of the images in the network, a multiple of 14 px.
+        device: where the network runs; auto takes a card where there is one.
+    """
+
+    checkpoint: Path | None = None
+    size: int = TRAINED_WIDTH_PX
+    device: Device = "auto"
+
+
+def make_vggt(context: BackboneContext, options: VggtOptions) -> FeedForwardBackbone:
+    """VGGT for one run.
 
     Raises:
         ConfigError: an option makes no sense.
         CheckpointError: there is no checkpoint.
         MissingDependencyError: the package is not installed; raised when the network is first needed.
     """
-    checkpoint, width, device = (
-        context.options.get(name, default)
-        for name, default in (("checkpoint", ""), ("size", str(TRAINED_WIDTH_PX)), ("device", "auto"))
-    )
-    if not checkpoint:
+    if options.checkpoint is None:
         raise CheckpointError(
             "--backbone vggt: needs --backbone-options checkpoint=FILE, the model.pt or model.safetensors "
             "that the authors publish as facebook/VGGT-1B; nothing is fetched for you, mind its licence"
         )
-    if not width.isdecimal() or int(width) < PATCH_PX or int(width) % PATCH_PX:
+    if options.size < PATCH_PX or options.size % PATCH_PX:
         raise ConfigError(
-            f"--backbone-options size={width}: a multiple of {PATCH_PX} px, by default {TRAINED_WIDTH_PX}"
+            f"--backbone-options size={options.size}: needed a multiple of {PATCH_PX} px, by default {TRAINED_WIDTH_PX}"
         )
-    if device not in ("auto", "cpu", "cuda"):
-        raise ConfigError(f"--backbone-options device={device}: one of auto, cpu, cuda")
     if context.collection.calibrated:
         context.reporter.warn("vggt predicts the cameras itself; the given calibration is not used")
     predictor = VggtPredictor(
-        context.collection, Path(checkpoint), width=int(width), device=device, reporter=context.reporter
+        context.collection,
+        options.checkpoint,
+        width=options.size,
+        device=options.device,
+        reporter=context.reporter,
     )
     return FeedForwardBackbone(predictor, context.collection, context.run, context.reporter)
+
+
+VGGT = BackbonePlugin(make=make_vggt, options=VggtOptions)
 
 
 class VggtPredictor:
@@ -179,7 +194,7 @@ class VggtPredictor:
     metric = False
 
     def __init__(
-        self, collection: ImageCollection, checkpoint: Path, *, width: int, device: str, reporter: Reporter
+        self, collection: ImageCollection, checkpoint: Path, *, width: int, device: Device, reporter: Reporter
     ) -> None:
         self.collection = collection
         self.checkpoint = checkpoint

@@ -52,7 +52,10 @@ _PARTS = (
 )
 
 # What a child process runs to import a backbone, and what it runs besides where more is worth knowing.
-_IMPORT_BACKBONE = "from smust3r_colmap.backbones.registry import load_factory\nload_factory({name!r})\n"
+_IMPORT_BACKBONE = """
+from smust3r_colmap.backbones.registry import find_backbone, load_plugin
+load_plugin(find_backbone({name!r}))
+"""
 _MORE_OF_BACKBONE = {
     "must3r": """
 from smust3r_colmap.backbones.must3r.precision import describe_precision

@@ -346,12 +346,20 @@ CONFIG = RunConfig(
     output=OutputConfig(trainer=False, dense=False),
 )
 ROOM_PACKAGE = """
+from dataclasses import dataclass
 from helpers.room_network import RoomPredictor
+from smust3r_colmap.backbones.base import BackbonePlugin
 from smust3r_colmap.backbones.feed_forward import FeedForwardBackbone
 
-def make(context):
-    predictor = RoomPredictor(context.collection, warnings=context.options.get("warnings", ""))
+@dataclass(frozen=True)
+class Options:
+    warnings: str = ""
+
+def make(context, options):
+    predictor = RoomPredictor(context.collection, warnings=options.warnings)
     return FeedForwardBackbone(predictor, context.collection, context.run, context.reporter)
+
+plugin = BackbonePlugin(make=make, options=Options)
 """
 
 
@@ -366,7 +374,7 @@ def photographed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def room(photographed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The demo's photographs, and the backbone ``room`` on the path."""
     site = tmp_path / "site"
-    install_package(site, "room-backbone", "[smust3r_colmap.backbones]\nroom = room_backbone:make\n")
+    install_package(site, "room-backbone", "[smust3r_colmap.backbones]\nroom = room_backbone:plugin\n")
     (site / "room_backbone.py").write_text(ROOM_PACKAGE, encoding="utf-8")
     monkeypatch.syspath_prepend(str(site))
     return photographed

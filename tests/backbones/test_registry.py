@@ -6,10 +6,10 @@ import re
 import subprocess
 import sys
 import types
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 from helpers.room_network import RoomNetwork, context_of, install_package
@@ -17,13 +17,13 @@ from helpers.room_network import RoomNetwork, context_of, install_package
 from smust3r_colmap.backbones import registry
 from smust3r_colmap.backbones.base import BackboneContext
 from smust3r_colmap.backbones.classical.backbone import ClassicalBackbone
+from smust3r_colmap.backbones.options import NoOptions, parse_options
 from smust3r_colmap.backbones.registry import (
     BUILT_IN,
     find_backbone,
     list_backbones,
-    load_factory,
+    load_plugin,
     make_backbone,
-    read_options,
 )
 from smust3r_colmap.config import OutputConfig, RunConfig, SegmentationConfig
 from smust3r_colmap.errors import CheckpointError, ConfigError, MissingDependencyError
@@ -62,8 +62,8 @@ def context(tmp_path: Path) -> BackboneContext:
     return context_of(EMPTY, RunDirectory(tmp_path / "run"))
 
 
-def with_backbone(context: BackboneContext, name: str, options: Mapping[str, str] | None = None) -> BackboneContext:
-    return replace(context, config=RunConfig(backbone=name), options=options or {})
+def with_backbone(context: BackboneContext, name: str, options: str = "") -> BackboneContext:
+    return replace(context, config=RunConfig(backbone=name, backbone_options=options))
 
 
 # ---------------------------------------------------------------------------------- names
@@ -79,7 +79,7 @@ def test_an_installed_backbone_is_found_by_its_name(install: Install, context: B
     known = find_backbone("othernet")
     assert (known.package, known.target) == ("other-net", "other_net:make")
     assert known in list_backbones()
-    made = make_backbone(with_backbone(context, "othernet", {"size": "7"}))
+    made = make_backbone(with_backbone(context, "othernet", "size=7"))
     assert made.name == "othernet 7"
 
 
@@ -102,7 +102,7 @@ def test_two_packages_cannot_share_a_name_and_others_still_work(install: Install
     install("two-net", WORKING, thenet="two_net:make")
     with pytest.raises(ConfigError, match=r"thenet: is claimed by one-net \(.*\) and two-net \(.*\); uninstall one"):
         find_backbone("thenet")
-    assert make_backbone(with_backbone(context, "mine", {"size": "1"})).name == "othernet 1"
+    assert make_backbone(with_backbone(context, "mine", "size=1")).name == "othernet 1"
 
 
 def test_a_package_that_lies_twice_on_the_path_is_one(install: Install, tmp_path: Path) -> None:
@@ -117,15 +117,24 @@ def test_a_package_that_lies_twice_on_the_path_is_one(install: Install, tmp_path
 
 # ---------------------------------------------------------------------------------- broken packages
 WORKING = """
+from dataclasses import dataclass
+from smust3r_colmap.backbones.base import BackbonePlugin
+
+@dataclass(frozen=True)
+class Options:
+    size: int = 3
+
 class Made:
     metric = has_tracks = False
     def describe(self): ...
     def reconstruct(self, segments, *, with_maps): ...
 
-def make(context):
+def make_other(context, options):
     made = Made()
-    made.name = f"othernet {context.options.get('size', '3')}"
+    made.name = f"othernet {options.size}"
     return made
+
+make = BackbonePlugin(make=make_other, options=Options)
 """
 
 
@@ -136,8 +145,14 @@ def make(context):
         ("1 / 0 +", "make", ConfigError, "of the package other-net.*is broken: SyntaxError"),
         ("raise RuntimeError('no card')", "make", ConfigError, "other-net.*is broken: RuntimeError: no card"),
         (WORKING, "makes", ConfigError, "other-net.*is broken: AttributeError: .*makes"),
-        ("make = 'text'", "make", ConfigError, "is a str, needed a function or class that takes the context"),
-        ("def make(context): return 3", "make", ConfigError, "gave a int without name, metric, has_tracks, describe"),
+        ("make = 'text'", "make", ConfigError, "is a str, needed a BackbonePlugin; see docs/backbones.md"),
+        (WORKING, "make_other", ConfigError, "is a function, needed a BackbonePlugin"),
+        (
+            WORKING.replace("return made", "return 3"),
+            "make",
+            ConfigError,
+            "made a int without name, metric, has_tracks, describe",
+        ),
         (WORKING.replace("has_tracks = ", ""), "make", ConfigError, "a Made without has_tracks; see docs/backbones.md"),
         (WORKING + "Made.reconstruct = 3", "make", ConfigError, "without reconstruct"),
     ],
@@ -172,8 +187,8 @@ print(sorted({"torch", "pycolmap", "numpy"} & set(sys.modules)))
 def test_a_classical_backbone_needs_no_torch() -> None:
     program = """
 import sys
-from smust3r_colmap.backbones.registry import load_factory
-load_factory("classical")
+from smust3r_colmap.backbones.registry import find_backbone, load_plugin
+load_plugin(find_backbone("classical"))
 print("torch" in sys.modules)
 """
     child = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
@@ -181,10 +196,26 @@ print("torch" in sys.modules)
 
 
 # ---------------------------------------------------------------------------------- options
-def test_options_are_names_and_values() -> None:
-    assert read_options("") == read_options(" , ") == {}
-    assert read_options("a=b, size = 3,path=/x=y") == {"a": "b", "size": "3", "path": "/x=y"}
-    assert read_options("empty=") == {"empty": ""}
+@dataclass(frozen=True, kw_only=True)
+class EveryKind:
+    weights: Path
+    a: str = ""
+    size: int = 3
+    threshold: float = 0.5
+    fast: bool = False
+    device: Literal["cpu", "cuda"] = "cpu"
+    head: Path | None = None
+
+
+def test_options_become_values_of_the_types_of_their_fields() -> None:
+    assert parse_options("weights=w", EveryKind, "net") == EveryKind(weights=Path("w"))
+    text = "weights=/x=y, a = b,size=7,threshold=1e-3,fast=true,device=cuda,head=h.pth"
+    expected = EveryKind(
+        weights=Path("/x=y"), a="b", size=7, threshold=1e-3, fast=True, device="cuda", head=Path("h.pth")
+    )
+    assert parse_options(text, EveryKind, "net") == expected
+    assert parse_options("weights=w,a=", EveryKind, "net").a == ""
+    assert parse_options("", NoOptions, "net") == parse_options(" , ", NoOptions, "net") == NoOptions()
 
 
 @pytest.mark.parametrize(
@@ -194,19 +225,25 @@ def test_options_are_names_and_values() -> None:
         ("a=1,=2", "'=2' is not name=value"),
         ("files=a.pth,b.pth", r"'b.pth' is not name=value \(a value cannot hold a comma\)"),
         ("a=1,b=2,a=3", "a is given twice, as '1' and '3'"),
+        ("a=1", "--backbone net: needs --backbone-options weights=..."),
+        ("weights=w,size=7.5", "size=7.5: needed a whole number"),
+        ("weights=w,threshold=high", "threshold=high: needed a number"),
+        ("weights=w,fast=yes", "fast=yes: needed true or false"),
+        ("weights=w,device=tpu", "device=tpu: needed one of cpu, cuda"),
+        ("weights=w,z=1,sise=2", "sise, z: the backbone net knows a, device, fast, head, size, threshold, weights"),
     ],
 )
-def test_options_that_are_none_are_refused(text: str, message: str) -> None:
+def test_options_that_make_no_sense_are_refused(text: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        read_options(text)
+        parse_options(text, EveryKind, "net")
 
 
-def test_options_that_nobody_reads_are_refused(install: Install, context: BackboneContext) -> None:
+def test_options_that_a_backbone_does_not_have_are_refused(install: Install, context: BackboneContext) -> None:
     with pytest.raises(ConfigError, match="--backbone-options seed: the backbone classical takes no options"):
-        make_backbone(with_backbone(context, "classical", {"seed": "1"}))
+        make_backbone(with_backbone(context, "classical", "seed=1"))
     install("other-net", WORKING, othernet="other_net:make")
     with pytest.raises(ConfigError, match="--backbone-options sise, z: the backbone othernet knows size"):
-        make_backbone(with_backbone(context, "othernet", {"sise": "1", "size": "1", "z": "2"}))
+        make_backbone(with_backbone(context, "othernet", "sise=1,size=1,z=2"))
 
 
 # ---------------------------------------------------------------------------------- the page
@@ -261,11 +298,11 @@ def test_the_example_of_the_page_refuses_well(
     mynet: Path, monkeypatch: pytest.MonkeyPatch, context: BackboneContext
 ) -> None:
     with pytest.raises(ConfigError, match="--backbone-options weigths: the backbone mynet knows weights"):
-        make_backbone(with_backbone(context, "mynet", {"weigths": "x", "weights": str(mynet)}))
+        make_backbone(with_backbone(context, "mynet", f"weigths=x,weights={mynet}"))
     with pytest.raises(CheckpointError, match=r"gone.pth: cannot be read: No such file"):
-        make_backbone(with_backbone(context, "mynet", {"weights": "gone.pth"}))
+        make_backbone(with_backbone(context, "mynet", "weights=gone.pth"))
     monkeypatch.setitem(sys.modules, "mynet", None)
-    made: Any = make_backbone(with_backbone(context, "mynet", {"weights": str(mynet)}))
+    made: Any = make_backbone(with_backbone(context, "mynet", f"weights={mynet}"))
     with pytest.raises(MissingDependencyError, match="pip install mynet"):
         _ = made.predictor.model
 
@@ -274,4 +311,4 @@ def test_every_backbone_of_the_page_exists() -> None:
     table = re.findall(r"^\| `(\w+)` ", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
     assert table == list(BUILT_IN)
     assert registry.ENTRY_POINT_GROUP in block_of_page("toml")
-    assert callable(load_factory("vggt"))
+    assert callable(load_plugin(find_backbone("vggt")).make)

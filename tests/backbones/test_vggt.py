@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.backbones.feed_forward import FeedForwardBackbone
 from smust3r_colmap.backbones.registry import make_backbone
-from smust3r_colmap.backbones.vggt import Crop, VggtPredictor
+from smust3r_colmap.backbones.vggt import Crop, Device, VggtPredictor
 from smust3r_colmap.config import LoopConfig, OutputConfig, RefinementConfig, RunConfig, SegmentationConfig
 from smust3r_colmap.errors import CheckpointError, ConfigError, MissingDependencyError, ReconstructionError
 from smust3r_colmap.evaluation.readers import read_reference_sparse
@@ -199,7 +199,8 @@ def backbone_of(
     collection: ImageCollection, run: RunDirectory, checkpoint: Path, options: Mapping[str, str] | None = None
 ) -> FeedForwardBackbone:
     given = {"checkpoint": str(checkpoint), "size": str(SIZE), **(options or {})}
-    made = make_backbone(context_of(collection, run, backbone="vggt", options=given))
+    text = ",".join(f"{name}={value}" for name, value in given.items())
+    made = make_backbone(context_of(collection, run, backbone="vggt", options=text))
     assert isinstance(made, FeedForwardBackbone)
     return made
 
@@ -375,10 +376,10 @@ def test_a_calibration_that_is_not_used_is_warned_about(
     [
         ({"checkpoint": ""}, CheckpointError, r"needs --backbone-options checkpoint=FILE, the model\.pt or"),
         ({"checkpoint": "gone.pt"}, CheckpointError, r"gone\.pt: cannot be read: No such file"),
-        ({"size": "500"}, ConfigError, "size=500: a multiple of 14 px, by default 518"),
-        ({"size": "-14"}, ConfigError, "size=-14: a multiple"),
-        ({"size": "large"}, ConfigError, "size=large: a multiple"),
-        ({"device": "tpu"}, ConfigError, "device=tpu: one of auto, cpu, cuda"),
+        ({"size": "500"}, ConfigError, "size=500: needed a multiple of 14 px, by default 518"),
+        ({"size": "-14"}, ConfigError, "size=-14: needed a multiple"),
+        ({"size": "large"}, ConfigError, "size=large: needed a whole number"),
+        ({"device": "tpu"}, ConfigError, "device=tpu: needed one of auto, cpu, cuda"),
         (
             {"weights": "x.pt"},
             ConfigError,
@@ -393,7 +394,7 @@ def test_options_that_make_no_sense_are_refused(
         backbone_of(ImageCollection(images=(), cameras=()), run, checkpoint, options)
 
 
-def predicted(collection: ImageCollection, checkpoint: Path, device: str = "auto") -> None:
+def predicted(collection: ImageCollection, checkpoint: Path, device: Device = "auto") -> None:
     reporter = QuietReporter(sys.stderr)
     VggtPredictor(collection, checkpoint, width=SIZE, device=device, reporter=reporter).describe()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -100,13 +99,12 @@ def context_of(
     run: RunDirectory,
     *,
     backbone: str = "classical",
-    options: Mapping[str, str] | None = None,
+    options: str = "",
 ) -> BackboneContext:
     """What the pipeline gives a backbone, for a quiet run."""
     return BackboneContext(
         collection=collection,
-        config=RunConfig(backbone=backbone),
-        options=options or {},
+        config=RunConfig(backbone=backbone, backbone_options=options),
         run=run,
         reporter=QuietReporter(sys.stderr),
         workers=1,

@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.backbones.base import BackboneContext, BackboneResult
+from smust3r_colmap.backbones.base import BackboneContext, BackbonePlugin, BackboneResult
 from smust3r_colmap.backbones.classical.calibration import (
     CalibrationTask,
     agree_on_cameras,
@@ -25,6 +25,7 @@ from smust3r_colmap.backbones.classical.calibration import (
 from smust3r_colmap.backbones.classical.dense import DepthTask, make_depth
 from smust3r_colmap.backbones.classical.mapping import METHOD_VERSION, MappedSegment, MappingTask, map_segment
 from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
+from smust3r_colmap.backbones.options import NoOptions
 from smust3r_colmap.colmap.database import open_database
 from smust3r_colmap.config import ClassicalConfig
 from smust3r_colmap.execution.progress import Reporter, Stage
@@ -388,8 +389,8 @@ def _read_matches(database: Path, pairs: Sequence[Pair]) -> InterSegmentMatches:
     return InterSegmentMatches(image_a=joined[0], feature_a=joined[1], image_b=joined[2], feature_b=joined[3])
 
 
-def make_classical(context: BackboneContext) -> ClassicalBackbone:
-    """The factory that the registry knows; it takes no options, for all its settings are in the configuration."""
+def make_classical(context: BackboneContext, options: NoOptions) -> ClassicalBackbone:
+    """The classical backbone of one run."""
     return ClassicalBackbone(
         context.collection,
         context.config.classical,
@@ -398,3 +399,6 @@ def make_classical(context: BackboneContext) -> ClassicalBackbone:
         workers=context.workers,
         seed=context.config.seed,
     )
+
+
+CLASSICAL = BackbonePlugin(make=make_classical, options=NoOptions)

@@ -14,9 +14,9 @@
         world_from_cam = must3r.register_camera(maps.points_cam, maps.points_world, maps.confidence)
 
 Inside, from the image to the pixel: ``preprocessing``, ``encoder`` (``blocks``, ``rope``), ``decoder`` with
-``memory`` and ``head``, ``cameras``, ``full_image``. ``drivers`` and ``slam`` run the network over many images,
-``keyframes`` choose which of them it remembers. ``checkpoint`` reads weights. ``backbone`` makes a backbone of it
-all for the pipeline, with ``token_cache``, ``memory_plan``, ``precision`` and ``retrieval``.
+``memory`` and ``head``, ``cameras``, ``full_image``. ``drivers`` runs the network over many
+images, ``keyframes`` chooses which of them are remembered. ``checkpoint`` reads weights. ``backbone`` makes a
+backbone of it all for the pipeline, with ``token_cache``, ``memory_plan``, ``precision`` and ``retrieval``.
 
 Source: the network specification, by whose sections the modules are cut; the architecture is that of Cabon et al.,
 "MUSt3R: Multi-view Network for Stereo 3D Reconstruction", CVPR 2025.

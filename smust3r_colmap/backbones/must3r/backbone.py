@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from smust3r_colmap.backbones.base import BackboneContext
+from smust3r_colmap.backbones.base import BackboneContext, BackbonePlugin
 from smust3r_colmap.backbones.feed_forward import (
     MIN_IMAGES,
     FeedForwardBackbone,
@@ -72,6 +72,7 @@ from smust3r_colmap.backbones.must3r.preprocessing import (
 )
 from smust3r_colmap.backbones.must3r.retrieval import RetrievalHead, mean_descriptor
 from smust3r_colmap.backbones.must3r.token_cache import TokenCache
+from smust3r_colmap.backbones.options import NoOptions
 from smust3r_colmap.backbones.weights.cache import find_weights, named_file
 from smust3r_colmap.config import Must3rConfig
 from smust3r_colmap.execution.progress import Reporter, Stage
@@ -93,8 +94,13 @@ DOUBTED_SHARE = 0.5
 """Of the images of a segment that may be unsure or inconsistent before the segment is doubted."""
 
 
-def make_must3r(context: BackboneContext) -> FeedForwardBackbone:
-    """The factory; see ``BackboneFactory``."""
+def make_must3r(context: BackboneContext, options: NoOptions) -> FeedForwardBackbone:
+    """MUSt3R for one run.
+
+    Raises:
+        CheckpointError: there are no weights, or they cannot be used.
+        ConfigError: the device or the precision is not available.
+    """
     settings = context.config.must3r
     device = choose_device(settings.device)
     head = settings.retrieval_weights
@@ -111,6 +117,9 @@ def make_must3r(context: BackboneContext) -> FeedForwardBackbone:
     )
     _warn_of_narrow_views(context, settings.network_size)
     return FeedForwardBackbone(predictor, context.collection, context.run, context.reporter)
+
+
+MUST3R = BackbonePlugin(make=make_must3r, options=NoOptions)
 
 
 def _warn_of_narrow_views(context: BackboneContext, size: int) -> None:

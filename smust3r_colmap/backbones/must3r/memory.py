@@ -88,22 +88,15 @@ class Memory:
             new[: len(self)] = old
         return _Storage(tuple(layers), len(self))
 
-    def tokens_of(self, label: int) -> RememberedImage:
-        """A copy of one image's tokens.
-
-        Raises:
-            KeyError: no image has this label.
-        """
-        rows = self._rows_of(label)
-        return tuple(layer[rows] for layer in self.layers)
-
     def overwrite_(self, label: int, image: RememberedImage) -> None:
         """Put fresh tokens in the place of an image's old ones (refinement, section 9.2).
 
         Raises:
             KeyError: no image has this label.
         """
-        rows = self._rows_of(label)
+        rows = torch.nonzero(self.labels == label)[:, 0]
+        if not len(rows):
+            raise KeyError(f"the memory has no image {label}")
         for layer, fresh in zip(self.layers, image, strict=True):
             layer[rows] = fresh
 
@@ -125,12 +118,6 @@ class Memory:
         other = Memory.__new__(Memory)
         other._storage, other.labels, other.num_images = self._storage, labels, num_images
         return other
-
-    def _rows_of(self, label: int) -> Tensor:
-        rows = torch.nonzero(self.labels == label)[:, 0]
-        if not len(rows):
-            raise KeyError(f"the memory has no image {label}")
-        return rows
 
 
 def _no_labels(like: Tensor) -> Tensor:

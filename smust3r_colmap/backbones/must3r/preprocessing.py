@@ -1,10 +1,11 @@
 """From a photo to what the network sees, and back to the pixels of the photo.
 
-The network wants few, fixed shapes: a centre crop of the photo, resized. `preprocess` is the route of batch
-reconstruction (the network specification, section 8.1), `preprocess_slam` that of video (8.2). Both reproduce the
-published network's input bit by bit, with one difference outside of this module: there, the EXIF orientation
-is ignored and a photo taken upright may lie on its side; here, images come from our importer, which has
-turned them already. The map back is a value of its own, `NetworkWindow`. Next: ``cameras``.
+The network takes few, fixed shapes: a centre crop of the photo, resized. `preprocess` gives the input of the
+published network bit by bit, with one difference outside of this module: there, the EXIF orientation is ignored and
+a portrait may lie on its side; here, images come from our importer, which has rotated them already. The map back is
+a value of its own, `NetworkWindow`. The next module to read is ``encoder``.
+
+Source: the network specification, section 8.1.
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from smust3r_colmap.errors import ImageError
 from smust3r_colmap.geometry.arrays import FloatArray, UInt8Array
 
 Resolution = tuple[int, int]
@@ -37,8 +37,6 @@ RESOLUTIONS: Mapping[int, tuple[Resolution, ...]] = MappingProxyType(
 """The published shapes by network size; earlier ones win a tie (the network specification, section 8.1)."""
 PATCH_SIZE = 16
 """Sides are multiples of it."""
-SQUARE_SIZES = (224, 336, 448)
-"""Sizes at which the video route crops to a square (the network specification, section 8.2)."""
 ROWS_AT_A_TIME = 256
 """Of a photo as floats in memory: 24 MiB for one of 8,000 pixels across, where all of 40 megapixels take 480."""
 
@@ -51,17 +49,16 @@ class NetworkWindow:
 
     Args:
         width_orig, height_orig: of the original image.
-        left, top, crop_width, crop_height: of what is seen, in original pixels; whole numbers on the route of batch
-            reconstruction, which crops first, and fractions on that of video, which resizes first.
+        left, top, crop_width, crop_height: of what is seen, in original pixels.
         width, height: of the network's image.
     """
 
     width_orig: int
     height_orig: int
-    left: float
-    top: float
-    crop_width: float
-    crop_height: float
+    left: int
+    top: int
+    crop_width: int
+    crop_height: int
     width: int
     height: int
 
@@ -80,18 +77,6 @@ class NetworkWindow:
         """(3, 3) exact, between pixels whose centres lie at +0.5."""
         scale_x, scale_y = self.orig_px_per_net_px
         return np.array([[scale_x, 0.0, self.left], [0.0, scale_y, self.top], [0.0, 0.0, 1.0]])
-
-    @property
-    def orig_from_net_as_published(self) -> FloatArray:
-        """(3, 3) as published: between pixels whose centres are whole numbers, and with the crop's shift unrounded.
-
-        Off the exact map by half a pixel where the sides differ by an odd number, and by another (scale - 1) / 2 for
-        the meaning of the coordinates (the network specification, sections 8.1 and 16.7).
-        """
-        matrix = self.orig_from_net
-        matrix[0, 2] = (self.width_orig - self.crop_width) / 2
-        matrix[1, 2] = (self.height_orig - self.crop_height) / 2
-        return matrix
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,11 +97,10 @@ class NetworkImage:
             raise ValueError(f"NetworkImage: pixels {tuple(self.pixels.shape)}, window {expected}")
 
 
-# ------------------------------------------------------------------- batch reconstruction
 def preprocess(
     image: UInt8Array | Image.Image, size: int, *, resolutions: Sequence[Resolution] | None = None
 ) -> NetworkImage:
-    """Centre crop to the nearest of the network's shapes, then resize; the route of batch reconstruction.
+    """Centre crop to the nearest of the network's shapes, then resize.
 
     Photos of any size and shape come out; one of 10:1 loses two thirds at its ends, a tiny one is enlarged, and of
     a side that the crop would leave empty one pixel stays. A square comes out as landscape.
@@ -133,8 +117,7 @@ def preprocess(
     """
     photo = _rgb(image)
     window = choose_window(photo.shape[1], photo.shape[0], resolutions or resolutions_of(size))
-    left, top = int(window.left), int(window.top)
-    cropped = photo[top : top + int(window.crop_height), left : left + int(window.crop_width)]
+    cropped = photo[window.top : window.top + window.crop_height, window.left : window.left + window.crop_width]
     return NetworkImage(pixels=_resized(cropped, window.height, window.width), window=window)
 
 
@@ -217,55 +200,6 @@ def _normalised(photo: UInt8Array) -> Tensor:
     """(H, W, 3) uint8 -> (3, H, W) float32 in [-1, 1]."""
     channels = np.ascontiguousarray(photo.transpose(2, 0, 1))
     return torch.from_numpy(channels).float().div_(255).sub_(0.5).div_(0.5)
-
-
-# ----------------------------------------------------------------------------------- video
-def preprocess_slam(image: UInt8Array | Image.Image, size: int) -> NetworkImage:
-    """Resize so that the longer side is ``size``, then crop the centre to whole patches; the route of video.
-
-    At the square sizes (224, 336, 448) the shorter side is resized to ``size`` and the centre square is cropped.
-
-    Args:
-        image: (H, W, 3) RGB, or a Pillow image, whose EXIF orientation is ignored.
-        size: in network pixels.
-
-    Raises:
-        ImageError: nothing is left of a side, which shrinks below a patch.
-        ValueError: the array is not (H, W, 3) uint8 or is empty.
-
-    Source: the network specification, section 8.2.
-    """
-    photo = Image.fromarray(_rgb(image))
-    longer, shorter = max(photo.size), min(photo.size)
-    target = longer / shorter * size if size in SQUARE_SIZES else size  # of the longer side, maybe a fraction
-    width, height = (round(side * target / longer) for side in photo.size)
-    half_width, half_height = (size // 2, size // 2) if size in SQUARE_SIZES else (_half(width), _half(height))
-    if not half_width or not half_height:
-        raise ImageError(
-            f"{photo.width} x {photo.height} pixels become {width} x {height} at network size {size}; "
-            f"{PATCH_SIZE} are needed on either side: take a larger size or crop the image"
-        )
-    resample = Image.Resampling.LANCZOS if longer > target else Image.Resampling.BICUBIC
-    left, top = width // 2 - half_width, height // 2 - half_height
-    box = (left, top, left + 2 * half_width, top + 2 * half_height)
-    pixels = _normalised(np.asarray(photo.resize((width, height), resample).crop(box)))
-    scale_x, scale_y = photo.width / width, photo.height / height
-    window = NetworkWindow(
-        width_orig=photo.width,
-        height_orig=photo.height,
-        left=left * scale_x,
-        top=top * scale_y,
-        crop_width=2 * half_width * scale_x,
-        crop_height=2 * half_height * scale_y,
-        width=2 * half_width,
-        height=2 * half_height,
-    )
-    return NetworkImage(pixels=pixels, window=window)
-
-
-def _half(side: int) -> int:
-    """Half of the largest centred stretch of whole patches."""
-    return 2 * (side // 2) // PATCH_SIZE * (PATCH_SIZE // 2)
 
 
 def _rgb(image: UInt8Array | Image.Image) -> UInt8Array:

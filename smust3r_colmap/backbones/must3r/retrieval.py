@@ -38,21 +38,6 @@ def mean_descriptor(image: EncodedImage) -> Descriptor:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LocalFeatures:
-    """The features of an image that tell most, strongest first.
-
-    Args:
-        features: (K, D).
-        attention: (K,) descending.
-        patches: (K,) int64, number of the patch of each, row by row.
-    """
-
-    features: Tensor
-    attention: Tensor
-    patches: Tensor
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Whitening:
     """x -> (x - mean) @ projection in float64. mean: (1, C). projection: (C, D)."""
 
@@ -72,14 +57,12 @@ class RetrievalHead:
         prewhiten, postwhiten: before and after everything else, where trained.
         projector: linear layers with layer norm and GELU between them; may be empty.
         residual: the projector's output is added to its input.
-        num_local: features kept per image; negative is the share of them, -0.5 half.
     """
 
     prewhiten: Whitening | None
     projector: nn.Sequential
     residual: bool
     postwhiten: Whitening | None
-    num_local: float
 
     @classmethod
     def load(cls, path: Path) -> RetrievalHead:
@@ -99,16 +82,6 @@ class RetrievalHead:
             return _head_from(vars(options), state)
         except ValueError as error:
             raise CheckpointError(f"{path} is not a retrieval head as published: {error}") from error
-
-    def local_features(self, image: EncodedImage) -> LocalFeatures:
-        """The most telling features of one image; of equals the patch that comes first.
-
-        Raises:
-            ValueError: the encoder has another width than the head.
-        """
-        features, attention = self._weighed(image)
-        order = torch.sort(attention, descending=True, stable=True).indices[: self._count(len(features))]
-        return LocalFeatures(features=features[order], attention=attention[order], patches=order)
 
     def global_descriptor(self, image: EncodedImage) -> Descriptor:
         """(D,) mean of all features weighted by attention, at unit length; zero where they are not finite.
@@ -145,19 +118,12 @@ class RetrievalHead:
         first = next(iter(self.projector), None)
         return first.in_features if isinstance(first, nn.Linear) else None
 
-    def _count(self, num_features: int) -> int:
-        wanted = self.num_local if self.num_local >= 0 else -self.num_local * num_features
-        return min(num_features, int(wanted))
-
 
 # -------------------------------------------------------------------------------- from a file
 def _head_from(options: Mapping[str, object], state: Mapping[str, object]) -> RetrievalHead:
     """Raises ValueError saying what does not fit."""
     if options.get("featweights", "l2norm") != "l2norm":
         raise ValueError(f"features weighted by {options['featweights']!r}, built is l2norm")
-    num_local = options.get("nfeat")
-    if isinstance(num_local, bool) or not isinstance(num_local, int | float):
-        raise ValueError(f"nfeat is {num_local!r}, needed a number")
     if not all(isinstance(values, Tensor) for values in state.values()):
         raise ValueError("the model holds more than tensors")
     tensors = {key: values for key, values in state.items() if isinstance(values, Tensor)}
@@ -166,7 +132,6 @@ def _head_from(options: Mapping[str, object], state: Mapping[str, object]) -> Re
         projector=_projector(tensors, _widths(options.get("hdims"))),
         residual=bool(options.get("residual")),
         postwhiten=_whitening(tensors, "postwhiten", wanted=options.get("postwhiten") is not None),
-        num_local=num_local,
     )
     _check_residual(head)
     if tensors:

@@ -28,14 +28,15 @@ from smust3r_colmap.backbones.must3r.architecture import (
 )
 from smust3r_colmap.backbones.must3r.backbone import Must3rPredictor, make_must3r
 from smust3r_colmap.backbones.must3r.checkpoint import write_safetensors_checkpoint
-from smust3r_colmap.backbones.must3r.recipe import recipe_weights
 from smust3r_colmap.backbones.must3r.state_dicts import empty_parts
+from smust3r_colmap.backbones.options import NoOptions
 from smust3r_colmap.cli.main import main
 from smust3r_colmap.config import CameraFit, ImportConfig, KeyframeStrategy, Must3rConfig, RunConfig
 from smust3r_colmap.execution.progress import QuietReporter, StageTally
 from smust3r_colmap.importers.image_folder import import_image_folder
 from smust3r_colmap.products import Segment
 from smust3r_colmap.storage.run_directory import RunDirectory
+from smust3r_colmap.synthetic.must3r_weights import random_network_weights
 from smust3r_colmap.synthetic.room import write_demo
 
 NUM_IMAGES = 14
@@ -62,7 +63,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Random weights that keep points in front of the cameras."""
     path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
-    made = recipe_weights(TINY, 7)
+    made = random_network_weights(TINY, 7)
     write_safetensors_checkpoint(path, TINY, made.encoder.state_dict(), made.decoder.state_dict())
     return path
 
@@ -106,12 +107,11 @@ def predictor(room: Path, weights: Path, tmp_path: Path) -> Iterator[Callable[..
         context = BackboneContext(
             collection=import_image_folder(room, importing),
             config=config,
-            options={},
             run=run,
             reporter=QuietReporter(sys.stderr),
             workers=1,
         )
-        made = make_must3r(context).predictor
+        made = make_must3r(context, NoOptions()).predictor
         assert isinstance(made, Must3rPredictor)
         return made
 

@@ -42,10 +42,10 @@ from smust3r_colmap.backbones.must3r.constructor_strings import (
     parse_call,
 )
 from smust3r_colmap.backbones.must3r.network import Network
-from smust3r_colmap.backbones.must3r.recipe import recipe_weights
 from smust3r_colmap.backbones.must3r.restricted_pickle import StandIn, read_pickled
 from smust3r_colmap.backbones.must3r.state_dicts import empty_parts
 from smust3r_colmap.errors import CheckpointError, ConfigError, StorageError
+from smust3r_colmap.synthetic.must3r_weights import random_network_weights
 
 ENCODER = "Dust3rEncoder(img_size=(32, 32), embed_dim=16, depth=2, num_heads=2)"
 DECODER = (
@@ -58,7 +58,7 @@ HEADER = "must3r architecture, version 1"
 
 @pytest.fixture(scope="module")
 def small() -> Network:
-    return recipe_weights(SMALL, seed=3)
+    return random_network_weights(SMALL, seed=3)
 
 
 def official(network: Network, **changes: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Keyframes, the drivers of a segment, and SLAM: against the reference vectors, then laws on a small network."""
+"""Keyframes and the drivers of a segment: against the reference vectors, then laws on a small network."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
+from helpers.memories import tokens_of
 from helpers.reference_vectors import needs_vectors, tiny_network, vectors
 from scipy.spatial.distance import cdist
 from torch import Tensor
@@ -48,10 +49,7 @@ from smust3r_colmap.backbones.must3r.keyframes import (
 )
 from smust3r_colmap.backbones.must3r.memory import Memory
 from smust3r_colmap.backbones.must3r.network import Network, encode
-from smust3r_colmap.backbones.must3r.preprocessing import preprocess_slam
-from smust3r_colmap.backbones.must3r.recipe import recipe_weights
-from smust3r_colmap.backbones.must3r.slam import Slam, SlamSettings
-from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.synthetic.must3r_weights import random_network_weights
 
 # Specification, section 17, where a second implementation came within 5e-6, 1.7e-5 and 3e-7.
 RAW, POSE, FOCAL, SCORE = 2e-5, 1e-4, 1e-4, 2e-6
@@ -294,36 +292,6 @@ def test_sectors_agree_with_upstream() -> None:
     np.testing.assert_array_equal(sectors_of(stored["quadrant_rays"], 2), stored["quadrant_id_x2"])
 
 
-@needs_vectors
-@pytest.mark.parametrize("initial", [1, 2])
-def test_slam_agrees_with_upstream(initial: int) -> None:
-    arrays, stored = Arrays("slam.npz", f"init{initial}"), vectors("slam.npz")
-    rule = NoveltyRule(
-        threshold=float(stored["keyframe_overlap_thr"]),
-        min_confidence=float(stored["min_conf_keyframe"]),
-        subsample=int(stored["kf_x_subsamp"]),
-        percentile=float(stored["overlap_percentile"]),
-    )
-    slam = Slam(tiny_network(), SlamSettings(initial=initial, rule=rule))
-    running_focal = []
-    for frame in stored["frames"]:
-        slam.add(encode(tiny_network(), [preprocess_slam(frame, int(stored["res"])).pixels])[0])
-        running_focal.append(slam.focal_net)
-    original_width, resized_width = stored["frames"].shape[2], 64
-    rerendered = list(slam.rerender())
-    arrays.compare("keyframes", [frame.index for frame in slam.frames if frame.is_keyframe], 0)
-    arrays.compare("timestamps", [frame.index for frame in slam.frames], 0)
-    arrays.compare("poses", [frame.world_from_cam for frame in slam.frames], POSE)
-    np.testing.assert_allclose(running_focal, arrays.take("running_focal"), rtol=FOCAL)
-    final_focal = slam.focal_net * original_width / resized_width
-    assert final_focal == pytest.approx(float(arrays.take("true_focal")), rel=FOCAL)
-    arrays.compare("confs", [frame.confidence for frame in slam.frames], RAW)
-    arrays.compare("mem_labels", slam.memory.labels, 0)
-    arrays.compare("rerender_poses", [frame.world_from_cam for frame in rerendered], POSE)
-    arrays.compare("num_images_kept", len(rerendered), 0)
-    arrays.all_taken()
-
-
 # ------------------------------------------------------------------------ laws on a small network
 @cache
 def small_network() -> Network:
@@ -334,7 +302,7 @@ def small_network() -> Network:
             encoder_width=32, width=32, depth=2, num_heads=2, rope=rope, feedback="single_mlp", memory_mode="kv"
         ),
     )
-    return recipe_weights(architecture, 7)
+    return random_network_weights(architecture, 7)
 
 
 @cache
@@ -476,7 +444,7 @@ def test_refinement_leaves_the_reference_alone_and_renews_the_others() -> None:
         for number in (0, 1)
     )
     for label in range(4):
-        for before, after in zip(plain.tokens_of(label), refined.tokens_of(label), strict=True):
+        for before, after in zip(tokens_of(plain, label), tokens_of(refined, label), strict=True):
             assert torch.equal(before, after) == (label == 0)
 
 
@@ -486,7 +454,7 @@ def test_refinement_shows_each_image_to_the_others_and_its_old_self() -> None:
     with small_network().running():
         fresh = small_network().decoder.see(images, memory).remembered[1]
     refined = finish(remember(small_network(), images, range(2), keyframes=range(2), refinements=1))[1].memory
-    assert same(refined.tokens_of(1), fresh)
+    assert same(tokens_of(refined, 1), fresh)
 
 
 def test_the_first_listed_image_is_the_reference_unless_ordered_by_shape() -> None:
@@ -527,7 +495,7 @@ def test_a_keyframe_of_another_shape_can_take_the_place() -> None:
     images = [*some_images(4), portrait]
     memory = finish(remember(small_network(), images, range(5), keyframes=WhereNew(most=4, rule=ALL_NEW)))[1].memory
     assert torch.bincount(memory.labels).tolist() == [6, 0, 6, 6, 8]
-    assert same(memory.tokens_of(0), first_tokens(images))
+    assert same(tokens_of(memory, 0), first_tokens(images))
 
 
 def first_tokens(images: Sequence[EncodedImage]) -> tuple[Tensor, ...]:
@@ -773,64 +741,3 @@ def test_a_prediction_that_is_partly_infinite_still_has_a_view() -> None:
     raw[0, 0] = 1e3  # beyond what float32 can hold once activated
     np.testing.assert_allclose(view_of(activate(raw)).centre_world, clean, rtol=0, atol=0.05)
     assert np.isnan(view_of(activate(torch.full_like(raw, 1e3))).centre_world).all()
-
-
-# ---------------------------------------------------------------------------------------------- slam
-def test_slam_starts_at_the_origin_and_keeps_its_initial_frames() -> None:
-    slam = Slam(small_network(), SlamSettings(initial=3, rule=NoveltyRule(threshold=np.inf)))
-    for image in some_images(6):
-        slam.add(image)
-    assert [frame.is_keyframe for frame in slam.frames] == [True, False, False, False, False, False]
-    np.testing.assert_array_equal(slam.frames[0].world_from_cam, np.eye(4))
-    assert set(slam.memory.labels.tolist()) == {0, 1, 2}
-    assert [frame.index for frame in slam.rerender()] == list(range(6))
-
-
-def test_slam_without_rerendering_holds_its_initial_frames_alone() -> None:
-    slam = Slam(small_network(), SlamSettings(initial=2, rerender=False))
-    for image in some_images(5):
-        slam.add(image)
-    assert [frame.index for frame in slam.rerender()] == [0, 1]
-
-
-def test_slam_frames_have_the_mean_focal_length() -> None:
-    slam = Slam(small_network(), SlamSettings(rule=NoveltyRule(threshold=-1.0, min_confidence=0.0)))
-    for image in some_images(4):
-        slam.add(image)
-    weights = np.array([frame.confidence - 1 for frame in slam.frames])
-    focals = np.array([frame.focal_net for frame in slam.frames])
-    assert slam.focal_net == pytest.approx(float(np.average(focals, weights=weights)))
-    assert slam.memory.num_images == 4
-
-
-def test_an_unsure_frame_is_no_keyframe_however_new() -> None:
-    slam = Slam(small_network(), SlamSettings(initial=1, rule=NoveltyRule(threshold=-1.0, min_confidence=1e6)))
-    frames = [slam.add(image) for image in some_images(3)]
-    assert [frame.is_keyframe for frame in frames] == [True, False, False]
-    assert [frame.score for frame in frames] == [np.inf, 0.0, 0.0]
-
-
-@cache
-def network_that_looks_behind() -> Network:
-    network = recipe_weights(small_network().architecture, 7)
-    with torch.no_grad():
-        network.decoder.head_dec.proj.bias.view(7, -1)[5] -= 20.0  # depth in the camera's frame
-    return network
-
-
-def test_frames_without_a_focal_length_do_not_count_in_its_mean() -> None:
-    slam = Slam(network_that_looks_behind())
-    assert np.isnan(slam.focal_net)
-    for image in some_images(3):
-        slam.add(image)
-    assert [frame.focal_net for frame in slam.frames] == [0.0, 0.0, 0.0]
-    assert np.isnan(slam.focal_net)
-    assert all(np.isfinite(frame.world_from_cam).all() for frame in (*slam.frames, *slam.rerender()))
-
-
-def test_a_frame_that_is_not_finite_is_refused_by_slam() -> None:
-    slam = Slam(small_network())
-    broken = EncodedImage(features=torch.full((6, 32), torch.nan), rows=2, columns=3)
-    slam.add(some_images(1)[0])
-    with pytest.raises(DegenerateAlignmentError, match="not finite"):
-        slam.add(broken)

@@ -32,8 +32,8 @@ from smust3r_colmap.backbones.must3r.memory_plan import (
     plan_memory,
 )
 from smust3r_colmap.backbones.must3r.precision import prepare
-from smust3r_colmap.backbones.must3r.recipe import recipe_weights
 from smust3r_colmap.errors import ConfigError, ReconstructionError
+from smust3r_colmap.synthetic.must3r_weights import random_network_weights
 
 MIB, GIB = 2**20, 2**30
 TOKENS = 24 * 32  # of an image of 512 x 384
@@ -51,7 +51,7 @@ def small_network(memory_mode: MemoryMode) -> Network:
     rope = Rope(trained_size=64, size=64)
     encoder = EncoderArchitecture(width=32, depth=1, num_heads=2, rope=rope)
     decoder = DecoderArchitecture(encoder_width=32, width=32, depth=3, num_heads=2, rope=rope, memory_mode=memory_mode)
-    return recipe_weights(Architecture(encoder=encoder, decoder=decoder), seed=2)
+    return random_network_weights(Architecture(encoder=encoder, decoder=decoder), seed=2)
 
 
 MODEL = MemoryModel(architecture=full_size(), tokens=TOKENS)

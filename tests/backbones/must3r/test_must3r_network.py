@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
+from helpers.memories import tokens_of
 from helpers.reference_vectors import needs_vectors, tiny_network, vectors
 from torch import Tensor, nn
 
@@ -34,8 +35,8 @@ from smust3r_colmap.backbones.must3r.architecture import (
     Rope,
 )
 from smust3r_colmap.backbones.must3r.cameras import estimate_focal, register_camera
-from smust3r_colmap.backbones.must3r.recipe import recipe_weights
 from smust3r_colmap.backbones.must3r.rope import grid_positions, rope_table, rotate
+from smust3r_colmap.synthetic.must3r_weights import random_network_weights
 
 ACCEPTED = 2e-5  # network specification, section 17
 ACCEPTED_FULL_SIZE = 5e-5
@@ -249,7 +250,7 @@ def test_full_size_network_is_that_of_the_vectors() -> None:
         encoder=EncoderArchitecture(rope=rope),
         decoder=DecoderArchitecture(rope=rope, feedback="single_mlp", memory_mode="kv"),
     )
-    network = recipe_weights(architecture, int(stored["seed"]))
+    network = random_network_weights(architecture, int(stored["seed"]))
     assert_recipe(network.encoder, "encoder")
     assert_recipe(network.decoder, "decoder")
 
@@ -385,7 +386,7 @@ def test_features_must_fit_their_grid() -> None:
 # ------------------------------------------------------------------------ laws: network
 def random_network(*, mode: MemoryMode = "kv", feedback: FeedbackKind = "single_mlp", seed: int = 5) -> Network:
     rope = Rope(trained_size=64, size=64)
-    return recipe_weights(
+    return random_network_weights(
         Architecture(
             encoder=EncoderArchitecture(width=16, depth=2, num_heads=2, rope=rope),
             decoder=DecoderArchitecture(
@@ -480,7 +481,7 @@ def test_images_of_one_update_may_come_in_any_order() -> None:
     forward, backward = (update_memory(network, memory, images[1:][::step]) for step in (1, -1))
     assert_equal(forward.raw, backward.raw[::-1])
     for label in (1, 2, 3):
-        assert_equal(forward.memory.tokens_of(label), backward.memory.tokens_of(4 - label))
+        assert_equal(tokens_of(forward.memory, label), tokens_of(backward.memory, 4 - label))
 
 
 def test_the_first_image_of_a_memory_is_the_reference_and_no_other() -> None:
@@ -603,7 +604,7 @@ def test_images_can_be_taken_out_of_the_memory_and_the_others_stay() -> None:
     fewer = memory.without([1, 3])
     assert set(fewer.labels.tolist()) == {0, 2} and fewer.num_images == 4
     for label in (0, 2):
-        assert_equal(fewer.tokens_of(label), memory.tokens_of(label), 0)
+        assert_equal(tokens_of(fewer, label), tokens_of(memory, label), 0)
     assert len(memory) == sum(len(image.features) for image in images)
     longer = update_memory(network, fewer, images[1:2]).memory
     assert set(longer.labels.tolist()) == {0, 2, 4}
@@ -613,13 +614,11 @@ def test_overwriting_an_image_changes_that_image_alone() -> None:
     network = random_network()
     images = random_images(network, MIXED)
     memory = init_memory(network, images).memory
-    kept = {label: memory.tokens_of(label) for label in range(4)}
+    kept = {label: tokens_of(memory, label) for label in range(4)}
     memory.overwrite_(2, tuple(tokens + 1 for tokens in kept[2]))
-    assert_equal(memory.tokens_of(2), [tokens + 1 for tokens in kept[2]], 0)
+    assert_equal(tokens_of(memory, 2), [tokens + 1 for tokens in kept[2]], 0)
     for label in (0, 1, 3):
-        assert_equal(memory.tokens_of(label), kept[label], 0)
-    with pytest.raises(KeyError, match=r"the memory has no image 9"):
-        memory.tokens_of(9)
+        assert_equal(tokens_of(memory, label), kept[label], 0)
     with pytest.raises(KeyError, match=r"the memory has no image 9"):
         memory.overwrite_(9, kept[0])
 
@@ -630,7 +629,7 @@ def test_labels_can_be_changed_and_the_count_with_them() -> None:
     changed = memory.relabelled(1, 7).counting(8)
     assert set(changed.labels.tolist()) == {0, 7} and changed.num_images == 8
     assert set(memory.labels.tolist()) == {0, 1} and memory.num_images == 2
-    assert_equal(changed.tokens_of(7), memory.tokens_of(1), 0)
+    assert_equal(tokens_of(changed, 7), tokens_of(memory, 1), 0)
 
 
 def test_reserved_memory_does_not_move_when_images_are_added() -> None:

@@ -18,8 +18,8 @@ from smust3r_colmap.backbones.must3r.precision import (
     describe_precision,
     prepare,
 )
-from smust3r_colmap.backbones.must3r.recipe import recipe_weights
 from smust3r_colmap.errors import ConfigError
+from smust3r_colmap.synthetic.must3r_weights import random_network_weights
 
 CPU, CARD = torch.device("cpu"), torch.device("cuda")
 
@@ -30,7 +30,7 @@ def small_network() -> Network:
     decoder = DecoderArchitecture(
         encoder_width=64, width=48, depth=3, num_heads=3, rope=rope, feedback="single_mlp", memory_mode="kv"
     )
-    return recipe_weights(Architecture(encoder=encoder, decoder=decoder), seed=5)
+    return random_network_weights(Architecture(encoder=encoder, decoder=decoder), seed=5)
 
 
 def raw_outputs(network: Network) -> torch.Tensor:

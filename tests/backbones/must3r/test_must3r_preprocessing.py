@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -15,16 +14,13 @@ from PIL import ExifTags, Image
 from smust3r_colmap.backbones.must3r import preprocessing
 from smust3r_colmap.backbones.must3r.preprocessing import (
     RESOLUTIONS,
-    SQUARE_SIZES,
     NetworkImage,
     NetworkWindow,
     choose_window,
     preprocess,
-    preprocess_slam,
     resolutions_of,
 )
-from smust3r_colmap.errors import ImageError
-from smust3r_colmap.geometry.arrays import UInt8Array
+from smust3r_colmap.geometry.arrays import FloatArray, UInt8Array
 
 
 def noise_photo(height: int, width: int, seed: int = 0) -> UInt8Array:
@@ -38,6 +34,18 @@ def coordinates_photo(height: int, width: int) -> UInt8Array:
     return photo
 
 
+def published_map(window: NetworkWindow) -> FloatArray:
+    """(3, 3) as published: between pixels whose centres are whole numbers, and with the crop's shift unrounded.
+
+    Off the exact map by half a pixel where the sides differ by an odd number, and by another (scale - 1) / 2 for
+    the meaning of the coordinates (the network specification, sections 8.1 and 16.7).
+    """
+    matrix = window.orig_from_net
+    matrix[0, 2] = (window.width_orig - window.crop_width) / 2
+    matrix[1, 2] = (window.height_orig - window.crop_height) / 2
+    return matrix
+
+
 # ------------------------------------------------------------------------------- vectors
 @needs_vectors
 @pytest.mark.parametrize("i", range(8))
@@ -48,19 +56,7 @@ def test_offline_route_gives_the_published_bits_and_matrix(i: int) -> None:
     assert made.pixels.dtype == torch.float32
     np.testing.assert_array_equal(made.pixels.numpy(), stored[f"img_{i}"])
     assert (made.window.height, made.window.width) == tuple(stored[f"true_shape_{i}"])
-    np.testing.assert_allclose(made.window.orig_from_net_as_published, stored[f"to_orig_{i}"], rtol=0, atol=1e-12)
-
-
-@needs_vectors
-@pytest.mark.parametrize("i", range(8))
-def test_video_route_gives_the_published_bits_offset_and_focal_factor(i: int) -> None:
-    stored = vectors("inputs.npz")
-    made = preprocess_slam(stored[f"raw_{i}"], 64)
-    np.testing.assert_array_equal(made.pixels.numpy(), stored[f"slam_img_{i}"][0])
-    scale_x, scale_y = made.window.orig_px_per_net_px
-    assert scale_x == pytest.approx(float(stored[f"slam_to_orig_focal_{i}"]), rel=1e-12)
-    offset = [made.window.left / scale_x, made.window.top / scale_y]
-    np.testing.assert_allclose(offset, stored[f"slam_offset_{i}"][0], atol=1e-9)
+    np.testing.assert_allclose(published_map(made.window), stored[f"to_orig_{i}"], rtol=0, atol=1e-12)
 
 
 @needs_vectors
@@ -68,11 +64,8 @@ def test_video_route_gives_the_published_bits_offset_and_focal_factor(i: int) ->
 def test_official_sizes_give_the_published_bits(case: int) -> None:
     stored = vectors("preprocess_official_sizes.npz")
     photo, size = stored[f"case{case}_raw"], int(stored[f"case{case}_size"])
-    made, video = preprocess(photo, size), preprocess_slam(photo, size)
+    made = preprocess(photo, size)
     np.testing.assert_array_equal(made.pixels.numpy()[:, ::4, ::4], stored[f"case{case}_img_every4"])
-    np.testing.assert_array_equal(video.pixels.numpy()[:, ::4, ::4], stored[f"case{case}_slam_img_every4"][0])
-    assert tuple(video.pixels.shape[1:]) == tuple(stored[f"case{case}_slam_true_shape"][0])
-    assert video.window.orig_px_per_net_px[0] == pytest.approx(float(stored[f"case{case}_slam_to_orig_focal"]))
     pixels = made.pixels.double()
     moments = [float(pixels.mean()), float(pixels.std(correction=0))]
     np.testing.assert_allclose(moments, stored[f"case{case}_img_mean_std"], atol=1e-6)
@@ -89,12 +82,9 @@ def test_every_published_choice_of_shape_is_made_again() -> None:
 
 # ------------------------------------------------------------------------- the way back
 @pytest.mark.parametrize(("height", "width"), [(187, 250), (250, 187), (103, 251), (201, 201), (131, 77)])
-@pytest.mark.parametrize("route", [preprocess, preprocess_slam])
 @pytest.mark.parametrize("size", [64, 224])
-def test_exact_map_leads_to_the_photo_pixel_that_was_seen(
-    height: int, width: int, route: Callable[[UInt8Array, int], NetworkImage], size: int
-) -> None:
-    made = route(coordinates_photo(height, width), size)
+def test_exact_map_leads_to_the_photo_pixel_that_was_seen(height: int, width: int, size: int) -> None:
+    made = preprocess(coordinates_photo(height, width), size)
     seen = (made.pixels.numpy() + 1) / 2 * 255 + 0.5  # a pixel's value is its index, its centre is half more
     x, y = np.meshgrid(np.arange(made.window.width) + 0.5, np.arange(made.window.height) + 0.5)
     to_orig = made.window.orig_from_net
@@ -106,7 +96,7 @@ def test_exact_map_leads_to_the_photo_pixel_that_was_seen(
 
 def test_published_map_is_off_the_exact_one_by_half_a_pixel_of_an_odd_crop() -> None:
     window = preprocess(noise_photo(66, 84), 64, resolutions=[(64, 48)]).window
-    off = window.orig_from_net_as_published - window.orig_from_net
+    off = published_map(window) - window.orig_from_net
     assert off[1, 2] == -0.5  # (66 - 63) / 2 = 1.5, cropped at 2
     assert np.count_nonzero(off) == 1
 
@@ -208,8 +198,7 @@ def test_pillow_image_gives_the_same_as_its_array_and_its_orientation_is_ignored
     photo = noise_photo(60, 90)
     image = Image.fromarray(photo)
     image.getexif()[ExifTags.Base.Orientation] = 6
-    for route in (preprocess, preprocess_slam):
-        assert torch.equal(route(image, 64).pixels, route(photo, 64).pixels)
+    assert torch.equal(preprocess(image, 64).pixels, preprocess(photo, 64).pixels)
 
 
 def test_grey_pillow_image_becomes_three_equal_channels() -> None:
@@ -217,25 +206,13 @@ def test_grey_pillow_image_becomes_three_equal_channels() -> None:
     assert torch.equal(made.pixels[0], made.pixels[2])
 
 
-@pytest.mark.parametrize("size", SQUARE_SIZES)
-def test_video_route_gives_squares_at_the_square_sizes(size: int) -> None:
-    for photo in (noise_photo(90, 200), noise_photo(200, 90), noise_photo(50, 50)):
-        assert tuple(preprocess_slam(photo, size).pixels.shape) == (3, size, size)
-
-
-def test_video_route_refuses_what_shrinks_below_a_patch() -> None:
-    with pytest.raises(ImageError, match="640 x 12 pixels become 512 x 10 at network size 512; 16 are needed"):
-        preprocess_slam(noise_photo(12, 640), 512)
-
-
 @pytest.mark.parametrize(
     "image",
     [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros((0, 4, 3), np.uint8)],
 )
 def test_arrays_that_are_no_photo_are_refused(image: UInt8Array) -> None:
-    for route in (preprocess, preprocess_slam):
-        with pytest.raises(ValueError, match=r"\(H, W, 3\) uint8 is needed"):
-            route(image, 512)
+    with pytest.raises(ValueError, match=r"\(H, W, 3\) uint8 is needed"):
+        preprocess(image, 512)
 
 
 @pytest.mark.parametrize("size", [0, -16, 100])

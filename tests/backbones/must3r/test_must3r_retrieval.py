@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 import torch
 from helpers.reference_vectors import needs_vectors, vectors
@@ -71,11 +72,6 @@ def test_head_reproduces_the_reference_vectors(tmp_path: Path) -> None:
     path = write(tmp_path / "head.pth", weights, hdims="32_64", nfeat=int(known["nfeat"]))
     head = RetrievalHead.load(path)
     image = encoded(torch.from_numpy(known["in_x"]))
-
-    local = head.local_features(image)
-    np.testing.assert_array_equal(local.patches, known["local_index"])
-    np.testing.assert_allclose(local.features, known["local_feat"], rtol=0, atol=1e-5)
-    np.testing.assert_allclose(local.attention, known["local_attn"], rtol=0, atol=1e-5)
     np.testing.assert_allclose(head.global_descriptor(image), known["global_feat"], rtol=0, atol=1e-5)
 
 
@@ -101,39 +97,35 @@ def test_descriptors_do_not_depend_on_the_order_of_patches(tmp_path: Path) -> No
     assert 0 < other @ head.global_descriptor(image) < 0.95
 
 
-@pytest.mark.parametrize(("nfeat", "count"), [(3, 3), (100, 8), (-0.5, 4), (-1.0, 8)])
-def test_number_of_local_features_is_absolute_or_a_share(tmp_path: Path, nfeat: float, count: int) -> None:
-    local = RetrievalHead.load(write(tmp_path / "head.pth", state(), nfeat=nfeat)).local_features(some_image())
-    assert len(local.features) == len(local.attention) == len(local.patches) == count
-    assert (local.attention.diff() <= 0).all()
+def weighted_by_norm(features: Tensor) -> npt.NDArray[np.float32]:
+    mean = features.norm(dim=1).double() @ features.double()
+    return np.asarray(mean / mean.norm(), np.float32)
 
 
-def test_head_without_any_part_gives_the_features_back(tmp_path: Path) -> None:
-    path = write(tmp_path / "head.pth", {}, prewhiten=None, postwhiten=None, hdims="", residual=False, nfeat=8)
+def test_head_without_any_part_weighs_the_features_by_their_norm(tmp_path: Path) -> None:
+    path = write(tmp_path / "head.pth", {}, prewhiten=None, postwhiten=None, hdims="", residual=False)
     image = some_image()
-    local = RetrievalHead.load(path).local_features(image)
-    torch.testing.assert_close(local.features, image.features[local.patches])
-    torch.testing.assert_close(local.attention, image.features.norm(dim=1)[local.patches])
+    descriptor = RetrievalHead.load(path).global_descriptor(image)
+    np.testing.assert_allclose(descriptor, weighted_by_norm(image.features), atol=1e-6)
 
 
 def test_residual_adds_what_went_into_the_projector(tmp_path: Path) -> None:
     image = some_image()
     tensors = {key: value for key, value in state().items() if "postwhiten" not in key}
-    by_patch = []
     for residual in (True, False):
-        path = write(tmp_path / f"{residual}.pth", tensors, residual=residual, postwhiten=None, nfeat=8)
-        head = RetrievalHead.load(path)
-        local = head.local_features(image)
-        by_patch.append(local.features[local.patches.argsort()])
-    assert head.prewhiten is not None
-    torch.testing.assert_close(by_patch[0] - by_patch[1], head.prewhiten(image.features))
+        head = RetrievalHead.load(write(tmp_path / f"{residual}.pth", tensors, residual=residual, postwhiten=None))
+        assert head.prewhiten is not None
+        whitened = head.prewhiten(image.features)
+        with torch.no_grad():
+            projected = head.projector(whitened)
+        expected = weighted_by_norm(projected + whitened if residual else projected)
+        np.testing.assert_allclose(head.global_descriptor(image), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
         ({"featweights": "learned"}, "weighted by 'learned'"),
-        ({"nfeat": "all"}, "nfeat is 'all'"),
         ({"hdims": "4"}, "gives 4 numbers, to be added to its 6"),
         ({"hdims": "4_x"}, "hdims is '4_x'"),
         ({"hdims": None}, "hdims is None"),

@@ -1,8 +1,8 @@
-"""Weights for tests and benchmarks when there are no others: random, and the same on every machine.
+"""Random weights of a MUSt3R network for tests and benchmarks, the same on every machine.
 
-They fill a network of any size with numbers that keep its activations in range and use every path
-(the feedback too, which a fresh network leaves at zero). Depth comes out positive, so that focal lengths
-and poses are well conditioned; the geometry means nothing.
+They keep the activations of a network of any size in range and use every path (the feedback too, which is zero in
+a freshly made network). Depth is positive, so that focal lengths and poses are well conditioned; the geometry is
+meaningless.
 Source: the weight recipe of the reference vectors of the network specification.
 """
 
@@ -16,19 +16,20 @@ from smust3r_colmap.backbones.must3r.architecture import CHANNELS, Architecture
 from smust3r_colmap.backbones.must3r.network import Network
 from smust3r_colmap.backbones.must3r.state_dicts import Shapes, empty_parts, shapes_of
 
-_POINT_CHANNELS = CHANNELS - 1  # all but the confidence
+_NUM_POINT_CHANNELS = CHANNELS - 1
+"""All but the confidence."""
 
 
-def recipe_weights(architecture: Architecture, seed: int) -> Network:
+def random_network_weights(architecture: Architecture, seed: int) -> Network:
     """A network on the CPU, encoder made from ``seed`` and decoder from ``seed + 1``."""
     encoder, decoder = empty_parts(architecture)
     for part, part_seed in ((encoder, seed), (decoder, seed + 1)):
-        part.load_state_dict(recipe_state(shapes_of(part.state_dict()), part_seed), assign=True)
+        part.load_state_dict(random_state(shapes_of(part.state_dict()), part_seed), assign=True)
         part.eval()
     return Network(architecture=architecture, encoder=encoder, decoder=decoder, device=torch.device("cpu"))
 
 
-def recipe_state(shapes: Shapes, seed: int) -> dict[str, Tensor]:
+def random_state(shapes: Shapes, seed: int) -> dict[str, Tensor]:
     """float32 tensors for the shapes of an encoder's or a decoder's state dict."""
     return {
         key: _weights_of(key, np.random.default_rng([seed, number]), shapes[key])
@@ -53,14 +54,14 @@ def _weights_of(key: str, rng: np.random.Generator, shape: tuple[int, ...]) -> T
 
 
 def _gain(shape: tuple[int, ...]) -> float:
-    """With it a layer gives numbers about as large as it takes; a factor, because a division rounds otherwise."""
+    """Keeps the size of activations from layer to layer; multiplied, because a division rounds differently."""
     return float(1 / np.sqrt(np.prod(shape[1:])))
 
 
 def _gain_of_channels(rows: int) -> Tensor:
     """(rows, 1) of the head: points vary little about the ramps, the confidence more."""
     gain = torch.full((rows, 1), 0.5)
-    gain[: rows * _POINT_CHANNELS // CHANNELS] = 0.15
+    gain[: rows * _NUM_POINT_CHANNELS // CHANNELS] = 0.15
     return gain
 
 
