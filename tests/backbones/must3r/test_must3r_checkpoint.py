@@ -36,11 +36,7 @@ from smust3r_colmap.backbones.must3r.checkpoint import (
     read_architecture,
     write_safetensors_checkpoint,
 )
-from smust3r_colmap.backbones.must3r.constructor_strings import (
-    architecture_from_strings,
-    image_size_is_named,
-    parse_call,
-)
+from smust3r_colmap.backbones.must3r.constructor_strings import architecture_from_strings, image_size_is_named
 from smust3r_colmap.backbones.must3r.network import Network
 from smust3r_colmap.backbones.must3r.restricted_pickle import StandIn, read_pickled
 from smust3r_colmap.backbones.must3r.state_dicts import empty_parts
@@ -274,7 +270,7 @@ def test_every_accepted_keyword_is_understood() -> None:
             r"embed_dmi of the encoder: unknown .*Dust3rEncoder\(embed_dmi=64\)",
         ),
         ("Dust3rEncoder()", "MUSt3R(head='DPT')", r"head of the decoder: DPT is not known, only Linear \(in .MUSt3R\("),
-        ("Dust3rEncoder()", "MUSt3R(memory_mode='all')", r"memory_mode .* all is not known, only kv, norm_y, raw"),
+        ("Dust3rEncoder()", "MUSt3R(memory_mode='all')", r"memory_mode .* all is not known, only norm_y, kv, raw"),
         ("Dust3rEncoder()", "MUSt3R(feedback_type='big')", r"feedback_type of the decoder: big is not known"),
         ("Dust3rEncoder()", "MUSt3R(feedback_type=partial(x))", r"feedback_type of the decoder"),
         ("Dust3rEncoder()", "MUSt3R(pointmaps_activation=ActivationType.RELU)", r"ActivationType.RELU is not known"),
@@ -298,11 +294,11 @@ def test_every_accepted_keyword_is_understood() -> None:
         ("Dust3rEncoder(embed_dim=64)", "MUSt3R()", r"the encoder gives 64 numbers per patch, the decoder takes 1024"),
         ("Dust3rEncoder()", "MUSt3R(embed_dim=100, num_heads=3)", r"100 over 3 heads"),
         ("Dust3rEncoder(64)", "MUSt3R()", r"arguments without a keyword"),
-        ("Dust3rEncoder(**options)", "MUSt3R()", r"\*\* and keywords given twice"),
-        ("Dust3rEncoder(depth=2, depth=3)", "MUSt3R()", r"cannot be read"),
-        ("Dust3rEncoder(depth=2 + 3)", "MUSt3R()", r"2 \+ 3' is neither a literal, a name nor a call"),
+        ("Dust3rEncoder(**options)", "MUSt3R()", r"arguments without a keyword"),
+        ("Dust3rEncoder(depth=2, depth=3)", "MUSt3R()", r"gives a keyword twice"),
+        ("Dust3rEncoder(depth=2 + 3)", "MUSt3R()", r"depth of the encoder: '2 \+ 3' is neither a literal nor a"),
         ("Dust3rEncoder(img_size=[s for s in x])", "MUSt3R()", r"neither a literal"),
-        ("(lambda: 0)()", "MUSt3R()", r"is not a name"),
+        ("(lambda: 0)()", "MUSt3R()", r"is not a call of Dust3rEncoder"),
         ("Dust3rEncoder", "MUSt3R()", r"is not a call"),
         ("'Dust3rEncoder()'", "MUSt3R()", r"is not a call"),
         ("Dust3rEncoder(", "MUSt3R()", r"cannot be read"),
@@ -328,14 +324,6 @@ def test_constructor_strings_are_not_evaluated(saved: Callable[..., Path], tmp_p
         assert not marker.exists()
     eval(code)  # so the code does what it is feared to do
     assert marker.exists()
-
-
-def test_calls_are_taken_apart_and_not_made() -> None:
-    call = parse_call("a.B(1, x=C.d, y=f(g, -2.5, z=(None, 'q')))")
-    assert (call.name, call.positional) == ("a.B", (1,))
-    assert str(call.keywords["x"]) == "C.d"
-    inner = call.keywords["y"]
-    assert repr(inner).startswith("Call(name='f'") and "-2.5" in repr(inner) and "(None, 'q')" in repr(inner)
 
 
 # ------------------------------------------------------------------------ hostile files
