@@ -1,14 +1,16 @@
 """Where fetched weights lie, and which file a reconstruction takes.
 
-The folder is ``weights`` in what the environment variable SMUST3R_CACHE names, else in
-``smust3r-colmap`` of the user's cache ($XDG_CACHE_HOME or ``~/.cache``). A network may lie there as
-published (``NAME.pth``), as converted (``NAME.safetensors``), or both.
+The folder is ``weights`` in what the environment variable SMUST3R_CACHE names, else in ``smust3r-colmap`` of the user's
+cache as ``platformdirs`` finds it. A network may lie there as published (``NAME.pth``), as converted
+(``NAME.safetensors``), or both.
 """
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+
+from platformdirs import user_cache_path
 
 from smust3r_colmap.backbones.weights.catalogue import CATALOGUE, Kind, OfficialFile, find_official
 from smust3r_colmap.errors import CheckpointError
@@ -22,10 +24,8 @@ CONVERTED_SUFFIX = ".safetensors"
 def weights_folder() -> Path:
     """The folder of fetched weights; it need not exist."""
     named = os.environ.get(CACHE_VARIABLE)
-    if named:
-        return Path(named).expanduser() / "weights"
-    user_cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(user_cache) / "smust3r-colmap" / "weights"
+    cache = Path(named).expanduser() if named else user_cache_path("smust3r-colmap", appauthor=False)
+    return cache / "weights"
 
 
 def published_place(file: OfficialFile) -> Path:

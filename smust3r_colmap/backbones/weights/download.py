@@ -1,30 +1,28 @@
-"""Fetching one large file so that no byte comes twice when the line breaks.
+"""Fetching one large file so that a broken connection costs none of the bytes that have come.
 
-The bytes go to ``NAME.part``. Beside it ``NAME.part.json`` has the length of the whole file and what
-the server calls this version of it (an ETag or a date), so that the rest is asked for with Range and
-If-Range (RFC 9110, sections 13.1.5 and 14.2): a server whose file has changed sends the new one whole,
-and so does one that cannot send a part. ``NAME`` appears when all bytes are there and their sum is right.
+The bytes go to ``NAME.part``. Beside it ``NAME.part.json`` has the length of the whole file and what the server calls
+this version of it (an ETag or a date), so that the rest is asked for with Range and If-Range (RFC 9110, sections 13.1.5
+and 14.2): a server whose file has changed sends the new one whole, and so does one that cannot send a part. ``NAME``
+appears when all bytes are there and their sum is right.
 
-Proxies are taken from the environment, as by any program that uses ``urllib``.
+``requests`` does the transfer and takes proxies from the environment. pooch would do the rest but for resuming: it
+begins a file anew after each break, which for 1.6 GiB is the point of this module.
 """
 
 from __future__ import annotations
 
-import http.client
 import json
 import os
 import re
 import shutil
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from http import HTTPStatus
-from http.client import HTTPResponse
 from pathlib import Path
 
+import requests
 from filelock import FileLock, Timeout
 
 from smust3r_colmap import __version__
@@ -34,6 +32,8 @@ from smust3r_colmap.errors import DownloadError
 from smust3r_colmap.execution.progress import Reporter
 
 _MIB = 2**20
+_BLOCK_BYTES = 2**16
+"""Read at once; of a block that breaks off nothing is kept."""
 
 # Ways out, for messages.
 _OTHER_DISK = f"make room, or name a folder on another disk in the environment variable {CACHE_VARIABLE}"
@@ -43,7 +43,7 @@ _BY_HAND = "get the file by other means, say a browser, and name it with --weigh
 def download(
     address: str, target: Path, *, md5: str, reporter: Reporter, timeout_s: float = 30.0, pause_s: float = 2.0
 ) -> None:
-    """Fetch ``address`` into ``target``, going on where an earlier call was broken off.
+    """Fetch ``address`` into ``target``, resuming an earlier call that was interrupted.
 
     Args:
         address: http or https.
@@ -54,9 +54,9 @@ def download(
         pause_s: wait before a broken connection, if it brought anything, is tried again.
 
     Raises:
-        DownloadError: another process fetches the same file; the server refuses; there is no
-            connection, or it breaks and trying again brings nothing; the disk is full or refuses;
-            the sum is wrong (then, and only then, what has come is thrown away).
+        DownloadError: another process fetches the same file; the server refuses; there is no connection, or it breaks
+            and trying again brings nothing; the disk is full or refuses; the sum is wrong (then, and only then, what
+            has come is thrown away).
     """
     part = _Part(part_of(target))
     with _only_process(target):
@@ -80,7 +80,7 @@ class _ConnectionBrokenError(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class _Version:
-    """What tells the whole file from another one at the same address.
+    """What the server says of the file it has.
 
     Args:
         num_bytes: of the whole file.
@@ -105,7 +105,7 @@ class _Part:
 
     @property
     def version(self) -> _Version | None:
-        """None where nothing was begun, or where what was noted down cannot be read."""
+        """None where nothing was begun, or where its note cannot be read."""
         try:
             return _Version(**json.loads(self._version_path.read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError):
@@ -113,7 +113,7 @@ class _Part:
 
     @property
     def num_bytes(self) -> int:
-        """Bytes to go on from; those of an unknown version are of no use."""
+        """Bytes to resume from; those of an unknown version are of no use."""
         return self.path.stat().st_size if self.version and self.path.is_file() else 0
 
     @property
@@ -134,8 +134,8 @@ class _Part:
             self.path.unlink(missing_ok=True)
             self._version_path.unlink(missing_ok=True)
 
-    def headers_to_go_on(self) -> dict[str, str]:
-        """Ask for the rest, on condition that the version is still the same; nothing when there is no part."""
+    def headers(self) -> dict[str, str]:
+        """Ask for the rest, on condition that the version is still the same; for everything when there is no part."""
         version, num_bytes = self.version, self.num_bytes
         if version is None or num_bytes == 0:
             return {}
@@ -178,39 +178,38 @@ def _fetch_rest(address: str, part: _Part, reporter: Reporter, *, timeout_s: flo
             _append(response, part, version, reporter)
 
 
-def _answer(address: str, part: _Part, timeout_s: float) -> HTTPResponse:
+def _answer(address: str, part: _Part, timeout_s: float) -> requests.Response:
     """What the server says to the request for what is missing: status 200 (everything) or 206 (the rest)."""
-    headers = {"User-Agent": f"smust3r-colmap/{__version__}", **part.headers_to_go_on()}
-    request = urllib.request.Request(address, headers=headers)
+    headers = {"User-Agent": f"smust3r-colmap/{__version__}", "Accept-Encoding": "identity", **part.headers()}
     try:
-        response: HTTPResponse = urllib.request.urlopen(request, timeout=timeout_s)
-    except urllib.error.HTTPError as error:
-        error.close()
-        if error.code == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and part.num_bytes:
-            part.remove()  # the file there is shorter now
-            return _answer(address, part, timeout_s)
-        raise DownloadError(
-            f"{address}: the server answers {error.code} {error.reason}; {_advice(error.code)}"
-        ) from error
-    except (OSError, http.client.HTTPException) as error:
+        response = requests.get(address, headers=headers, stream=True, timeout=timeout_s)
+    except requests.RequestException as error:
         raise _ConnectionBrokenError(f"no connection ({_cause(error)})") from error
-    return response
+    if response.ok:
+        return response
+    response.close()
+    if response.status_code == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and part.num_bytes:
+        part.remove()  # the file there is shorter now
+        return _answer(address, part, timeout_s)
+    status = f"{response.status_code} {response.reason}"
+    raise DownloadError(f"{address}: the server answers {status}; {_advice(response.status_code)}")
 
 
-def _span(address: str, response: HTTPResponse) -> tuple[int, _Version]:
+def _span(address: str, response: requests.Response) -> tuple[int, _Version]:
     """Where the bytes that follow begin in the file, and the version of the file.
 
     Raises:
-        DownloadError: it is a page for people, as networks send that want a log-in first, or the server
-            does not say how long the file is.
+        DownloadError: it is a page for people, as networks send that want a log-in first, or the server does not say
+            how long the file is.
     """
-    if response.headers.get_content_type() == "text/html":
+    if response.headers.get("Content-Type", "").startswith("text/html"):
         raise DownloadError(f"{address}: what comes is a web page (a log-in of the network?); {_BY_HAND}")
-    if response.status == HTTPStatus.PARTIAL_CONTENT:
+    if response.status_code == HTTPStatus.PARTIAL_CONTENT:
         match = re.fullmatch(r"bytes (\d+)-\d+/(\d+)", response.headers.get("Content-Range", ""))
         first_byte, num_bytes = (int(match[1]), int(match[2])) if match else (0, 0)
     else:
-        first_byte, num_bytes = 0, response.length or 0
+        length = response.headers.get("Content-Length", "")
+        first_byte, num_bytes = 0, int(length) if length.isdecimal() else 0
     if num_bytes == 0:
         raise DownloadError(f"{address}: the server does not say how long the file is; {_BY_HAND}")
     tag = response.headers.get("ETag", "")
@@ -219,21 +218,19 @@ def _span(address: str, response: HTTPResponse) -> tuple[int, _Version]:
     return first_byte, _Version(num_bytes=num_bytes, validator=validator)
 
 
-def _append(response: HTTPResponse, part: _Part, version: _Version, reporter: Reporter) -> None:
+def _append(response: requests.Response, part: _Part, version: _Version, reporter: Reporter) -> None:
     """Write the bytes of the response behind those of the part, telling of each MiB."""
     done = part.num_bytes
     _check_space(part.path, missing=version.num_bytes - done)
     total_mib = -(-version.num_bytes // _MIB)
-    name = part.path.with_suffix("").name
     with (
-        reporter.stage(f"{name}, MiB", total=total_mib) as stage,
+        reporter.stage(f"{part.path.stem}, MiB", total=total_mib) as stage,
         _disk_errors(part.path),
         part.path.open("ab") as file,
     ):
         done_mib = done // _MIB
         stage.skip(done_mib)
-        while done < version.num_bytes:
-            block = _read(response, at_most=min(_MIB, version.num_bytes - done))
+        for block in _blocks(response):
             file.write(block)
             done += len(block)
             now_mib = total_mib if done == version.num_bytes else done // _MIB
@@ -241,17 +238,16 @@ def _append(response: HTTPResponse, part: _Part, version: _Version, reporter: Re
             done_mib = now_mib
         file.flush()
         os.fsync(file.fileno())
-
-
-def _read(response: HTTPResponse, *, at_most: int) -> bytes:
-    """The next bytes, as they come."""
-    try:
-        block = response.read1(at_most)
-    except (OSError, http.client.HTTPException) as error:
-        raise _ConnectionBrokenError(f"the connection broke ({_cause(error)})") from error
-    if not block:
+    if done < version.num_bytes:
         raise _ConnectionBrokenError("the connection ended before the file did")
-    return block
+
+
+def _blocks(response: requests.Response) -> Iterator[bytes]:
+    """The bytes of the response, as they come."""
+    try:
+        yield from response.iter_content(_BLOCK_BYTES)
+    except requests.RequestException as error:
+        raise _ConnectionBrokenError(f"the connection broke ({_cause(error)})") from error
 
 
 def _check_space(path: Path, *, missing: int) -> None:
@@ -298,7 +294,8 @@ def _advice(status: int) -> str:
     return f"the server or a proxy does not let this program in: {_BY_HAND}"
 
 
-def _cause(error: Exception) -> str:
-    """The reason in words; urllib wraps it, and some have none."""
-    reason = getattr(error, "reason", error)
-    return str(reason) or type(reason).__name__
+def _cause(error: BaseException) -> str:
+    """The first reason in words; requests wraps those of urllib3, which wraps those of the system."""
+    while error.__context__ is not None:
+        error = error.__context__
+    return str(error) or type(error).__name__

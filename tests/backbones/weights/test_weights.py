@@ -52,7 +52,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.delenv("SMUST3R_WEIGHTS", raising=False)
     for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr("urllib.request._opener", None)  # it keeps the proxies of the first request
     return tmp_path / "cache" / "weights"
 
 
@@ -167,7 +166,7 @@ class Fetcher:
     def broken_off_at(self, num_bytes: int) -> None:
         """Leave a part of so many bytes behind."""
         self.mirror.cuts = [num_bytes, 0]
-        with pytest.raises(DownloadError, match="the connection ended"):
+        with pytest.raises(DownloadError, match="the connection broke"):
             self()
         assert part_of(self.target).stat().st_size == num_bytes
         self.mirror.requests.clear()
@@ -243,7 +242,7 @@ def test_a_server_that_knows_no_ranges_sends_all_again(fetch: Fetcher) -> None:
 def test_a_server_that_cuts_and_knows_no_ranges_is_not_asked_for_ever(fetch: Fetcher) -> None:
     fetch.mirror.knows_ranges = False
     fetch.mirror.cuts = [MIB] * 10
-    with pytest.raises(DownloadError, match="the connection ended"):
+    with pytest.raises(DownloadError, match="the connection broke"):
         fetch()
 
     assert len(fetch.mirror.requests) == 2
@@ -331,7 +330,7 @@ def test_no_network_names_the_ways_out(folder: Path) -> None:
 def test_a_silent_server_is_left_after_the_timeout(fetch: Fetcher) -> None:
     fetch.mirror.cuts, fetch.mirror.stalls = [MIB, 0], True
     started_s = time.monotonic()
-    with pytest.raises(DownloadError, match=r"the connection broke \(timed out\)"):
+    with pytest.raises(DownloadError, match=r"the connection broke \(.*timed out\)"):
         fetch(timeout_s=0.2)
 
     assert 0.4 < time.monotonic() - started_s < 10.0
@@ -428,7 +427,7 @@ import signal
 import sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs are born deaf to Ctrl-C
 from dataclasses import replace
-from smust3r_colmap.weights import catalogue
+from smust3r_colmap.backbones.weights import catalogue
 catalogue.CATALOGUE = [replace(catalogue.CATALOGUE[0], md5=sys.argv[1])]
 from smust3r_colmap.cli.main import main
 sys.exit(main(["weights", "fetch", "--accept-licence", "--base-url", sys.argv[2]]))
@@ -883,7 +882,7 @@ import contextlib, sys
 from smust3r_colmap.cli.main import main
 with contextlib.suppress(SystemExit):
     main(["weights", "fetch", "--help"])
-print("LOADED", sorted({"torch", "numpy", "urllib.request", "filelock"} & set(sys.modules)))
+print("LOADED", sorted({"torch", "numpy", "requests", "filelock"} & set(sys.modules)))
 """
     child = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
 
