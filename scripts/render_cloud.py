@@ -4,7 +4,7 @@
     python scripts/render_cloud.py OUT picture.png --overview [--azimuth 30] [--elevation 40]
 
 The first form is for finding doubled walls: three views beside each other, from above, from the side and through
-one of the cameras. Up is the mean up direction of the cameras. Nearer points cover farther ones.
+one of the cameras. Nearer points cover farther ones.
 
 The second form is for showing the result: one perspective view from outside, with all cameras. Surfaces that are
 seen from behind are left out, so that a room opens towards the viewer.
@@ -31,6 +31,8 @@ from smust3r_colmap.geometry.arrays import FloatArray, UInt8Array
 SIDE_PX = 900
 BACKGROUND = 255
 CAMERA_RGB = (220, 30, 30)
+STEADIER = 0.5
+"""Length of the cameras' mean y axis over that of their mean viewing direction, below which they look down."""
 
 OVERVIEW_PX = (960, 520)
 """Width and height of the overview."""
@@ -146,11 +148,18 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
 
 
 def level_frame(images: Sequence[pycolmap.Image]) -> FloatArray:
-    """(3, 3) rotation whose second row is the cameras' mean down direction."""
+    """(3, 3) rotation whose second row is down, and whose first is about the first camera's x axis.
+
+    Down is the mean y axis of the cameras, or the mean viewing direction where that is much steadier: from a drone that
+    looks down and turns at the end of each strip.
+    """
     world_from_cam = np.array([image.cam_from_world().inverse().rotation.matrix() for image in images])
-    down = world_from_cam[:, :, 1].mean(axis=0)
-    down /= np.linalg.norm(down)
-    right = np.cross(down, world_from_cam[0, :, 2])
+    y, z = world_from_cam[:, :, 1].mean(axis=0), world_from_cam[:, :, 2].mean(axis=0)
+    down, forward = y, world_from_cam[0, :, 2]
+    if np.linalg.norm(y) < STEADIER * np.linalg.norm(z):
+        down, forward = z, -world_from_cam[0, :, 1]
+    down = down / np.linalg.norm(down)
+    right = np.cross(down, forward)
     right /= np.linalg.norm(right)
     return np.array([right, down, np.cross(right, down)])
 

@@ -102,3 +102,19 @@ def test_a_folder_without_a_model_is_refused(run: Path, tmp_path: Path, capsys: 
     (run / "sparse/0/cameras.bin").unlink()
     assert script.main([str(run), str(tmp_path / "picture.png")]) == 2
     assert "sparse/0: no COLMAP model; is this the output of a finished run?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("looks_down", [False, True])
+def test_the_level_frame_knows_what_is_down(looks_down: bool) -> None:
+    """Cameras that all look ahead and turn about the vertical, or that look down and turn about their own axis."""
+    down_of_cam = np.array([0.0, 0.0, 1.0] if looks_down else [0.0, 1.0, 0.0])
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 50.0, 64, 48))
+    for turn_deg in (0.0, 175.0, 5.0, 180.0):
+        rotation = pycolmap.Rotation3d(np.deg2rad(turn_deg) * down_of_cam)
+        image = pycolmap.Image(name=f"{turn_deg}", camera_id=1, image_id=int(turn_deg) + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(rotation, np.zeros(3)))
+    level_from_world = script.level_frame([model.image(i) for i in sorted(model.reg_image_ids())])
+    np.testing.assert_allclose(level_from_world @ level_from_world.T, np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(level_from_world[1], down_of_cam, atol=1e-9)
+    np.testing.assert_allclose(level_from_world[0], [1, 0, 0], atol=1e-9)
