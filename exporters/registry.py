@@ -14,8 +14,9 @@ from pathlib import Path
 import pycolmap
 
 from smust3r_colmap.colmap.model_files import MODEL_FILES, refuse_names_text_cannot_hold, write_text_checked
-from smust3r_colmap.config import OutputConfig
+from smust3r_colmap.config import OutputConfig, RunConfig
 from smust3r_colmap.errors import InputError, MissingDependencyError, ReconstructionError
+from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.execution.stage_clock import StageClock
 from smust3r_colmap.exporters.colmap_sparse import write_colmap_sparse
 from smust3r_colmap.exporters.dense_workspace import write_dense_workspace
@@ -24,9 +25,12 @@ from smust3r_colmap.exporters.mesh import MeshMethod, write_mesh
 from smust3r_colmap.exporters.ply import write_ply
 from smust3r_colmap.exporters.trainer_folder import write_trainer_folder
 from smust3r_colmap.exporters.tum_trajectory import write_tum
-from smust3r_colmap.report.summary import MissingOutput
-from smust3r_colmap.storage.atomic_write import atomic_file, atomic_folder
-from smust3r_colmap.storage.finished_run import FinishedRun
+from smust3r_colmap.importers.masks import masks_of
+from smust3r_colmap.products import FusedScene, ImageCollection, Scene
+from smust3r_colmap.refinement.stage import InitialScenes, Refinement
+from smust3r_colmap.storage.atomic_write import atomic_file, atomic_folder, write_atomically
+from smust3r_colmap.storage.config_file import config_to_toml
+from smust3r_colmap.storage.finished_run import FinishedRun, write_finished
 
 TRAINER_FOLDER, DENSE_FOLDER, DATABASE_FILE = "trainer", "dense", "database.db"
 _NAMES_SHOWN = 3
@@ -77,6 +81,52 @@ class Format:
     about: str
     reads_images: bool = False
     reads_masks: bool = False
+
+
+def export(
+    run: Run,
+    fused: Sequence[FusedScene],
+    refinement: Refinement | None,
+    initial: InitialScenes,
+    images: Path,
+    collection: ImageCollection,
+    config: RunConfig,
+    *,
+    before: Mapping[str, Scene],
+) -> Outputs:
+    """Write a run: every model for COLMAP, the other formats of the largest, and what led to it.
+
+    Args:
+        fused: the finished models, largest first.
+        refinement: their tracks, if any.
+        initial: the scenes before refinement.
+        images: folder of the images.
+        collection: the images.
+        config: the settings, which are written, too.
+        before: scenes of earlier steps, by the file below the output folder that gets their poses.
+    """
+    run.folder.clear_results(MODEL_FILES)
+    has_tracks = refinement is not None and any(refinement.models)
+    finished = FinishedRun(
+        output=run.folder.root,
+        native_log=run.folder.native_log,
+        images=images,
+        scenes=tuple(one.scene for one in fused),
+        models=(None,) * len(fused) if refinement is None else refinement.models,
+        database=refinement.database if refinement is not None and has_tracks else None,
+        maps=initial.maps,
+        masks=masks_of(collection, config.importing.masks),
+    )
+    settings = FormatSettings.of(config.output)
+    with run.clock.stage("export", total=1) as progress:
+        for name in ("sparse", "ply", "glb", "tum", *(("database",) if has_tracks else ())):
+            FORMATS[name].write(finished, settings)
+        for name, scene in {"trajectory_stitched_tum.txt": initial.scenes[0], **before}.items():
+            write_tum(scene, run.folder.root / name, None)
+        write_atomically(run.folder.root / "config.toml", config_to_toml(config).encode())
+        write_finished(run.folder, finished)
+        progress.advance()
+    return write_where_possible(finished, config.output.large_formats if has_tracks else (), settings, run.clock)
 
 
 def write_where_possible(
@@ -255,6 +305,14 @@ class Written:
 
     name: str
     notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class MissingOutput:
+    """A part of the result that could not be written, and why."""
+
+    name: str
+    reason: str
 
 
 @dataclass(frozen=True, kw_only=True)

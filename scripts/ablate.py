@@ -58,7 +58,7 @@ from smust3r_colmap.segmentation.windows import plan_windows
 from smust3r_colmap.stitching.camera_fusion import fuse_cameras
 from smust3r_colmap.stitching.resection import PlacedSubmodel, place_submodel
 from smust3r_colmap.stitching.spanning_tree import ChainedPart
-from smust3r_colmap.stitching.stitch import Stitching, stitch
+from smust3r_colmap.stitching.stitch import Stitching, stitch_submodels
 from smust3r_colmap.synthetic.backbone import OracleBackbone, oracle_maps
 from smust3r_colmap.synthetic.room import write_demo
 from smust3r_colmap.synthetic.settings import PRESETS, REFERENCE_LENGTH, OracleSettings
@@ -247,7 +247,7 @@ def solve(
         seed=config.seed,
         advance=lambda _: None,
     )
-    stitching = stitch(
+    stitching = stitch_submodels(
         result.submodels,
         edges.alignments,
         loops,

@@ -436,9 +436,36 @@ class DepthMaps(Protocol):
 EMPTY_CLOUD = PointCloud(xyz=np.empty((0, 3)), rgb=np.empty((0, 3), np.uint8))
 
 
-def largest_first(scenes: Sequence[Scene]) -> tuple[Scene, ...]:
-    """Scenes by falling number of images; ties keep their order."""
-    return tuple(sorted(scenes, key=len, reverse=True))
+@dataclass(frozen=True, kw_only=True)
+class CloudStatistics:
+    """How a fused cloud came about.
+
+    Args:
+        voxel_size: edge of the cells that were averaged, in world units; NaN for an empty cloud.
+        num_pixels: confident pixels of all maps used.
+        num_samples: of these, gathered.
+        num_far: samples dropped because they lie more than a million voxels from the middle.
+        num_seen_once: voxels dropped because one image only saw them.
+    """
+
+    voxel_size: float
+    num_pixels: int
+    num_samples: int
+    num_far: int
+    num_seen_once: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FusedScene:
+    """A finished model.
+
+    Args:
+        scene: with its points.
+        statistics: of the cloud; None where the points were not fused from depth maps.
+    """
+
+    scene: Scene
+    statistics: CloudStatistics | None
 
 
 @dataclass(frozen=True, kw_only=True)

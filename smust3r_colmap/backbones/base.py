@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from smust3r_colmap.config import RunConfig
-from smust3r_colmap.execution.progress import Reporter
+from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.products import (
     DenseMaps,
     ImageCollection,
@@ -25,7 +25,6 @@ from smust3r_colmap.products import (
     SegmentReconstruction,
     Submodel,
 )
-from smust3r_colmap.storage.run_directory import RunDirectory
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,16 +87,12 @@ class BackboneContext:
     Args:
         collection: the images of the run.
         config: every setting.
-        run: where finished work is kept.
-        reporter: told about every stage.
-        workers: processes or threads that may run at once, at least one.
+        run: where finished work is kept, how tasks run, who is told about every stage.
     """
 
     collection: ImageCollection
     config: RunConfig
-    run: RunDirectory
-    reporter: Reporter
-    workers: int
+    run: Run
 
 
 BackboneFactory = Callable[[BackboneContext], Backbone]

@@ -20,7 +20,8 @@ import numpy.typing as npt
 
 from smust3r_colmap.backbones.base import BackboneResult
 from smust3r_colmap.errors import CheckpointError
-from smust3r_colmap.execution.progress import Reporter, Stage
+from smust3r_colmap.execution.progress import Stage
+from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import (
     DenseMaps,
@@ -32,7 +33,6 @@ from smust3r_colmap.products import (
 )
 from smust3r_colmap.storage.dense_maps import ImageMaps, StoredMaps, write_maps
 from smust3r_colmap.storage.run_directory import (
-    RunDirectory,
     StageFolder,
     key_of,
     read_arrays,
@@ -133,26 +133,22 @@ class FeedForwardBackbone:
     Args:
         predictor: made for the collection.
         collection: the images of the run.
-        run: where finished work is kept.
-        reporter: told about every stage.
+        run: where finished work is kept, and who is told about every stage.
     """
 
     has_tracks = False
 
-    def __init__(
-        self, predictor: Predictor, collection: ImageCollection, run: RunDirectory, reporter: Reporter
-    ) -> None:
+    def __init__(self, predictor: Predictor, collection: ImageCollection, run: Run) -> None:
         self.predictor = predictor
         self.collection = collection
         self.run = run
-        self.reporter = reporter
         self.name = predictor.name
         self.metric = predictor.metric
 
     def describe(self) -> npt.NDArray[np.float32]:
         """See ``Backbone``."""
         digests = [image.digest for image in self.collection.images]
-        stored = self.run.stage("descriptors", key=key_of("descriptors", self.name, self.predictor.key, digests))
+        stored = self.run.folder.stage("descriptors", key=key_of("descriptors", self.name, self.predictor.key, digests))
         if not stored.is_done:
             made = _unit_rows(self.predictor.describe(), len(self.collection))
             with stored.write() as folder:
@@ -164,7 +160,7 @@ class FeedForwardBackbone:
         """See ``Backbone``; a network makes the maps anyway, so every segment has them."""
         del with_maps
         folders = [self._folder(segment) for segment in segments]
-        with self.reporter.stage(self.name, total=sum(len(segment.images) for segment in segments)) as stage:
+        with self.run.clock.stage(self.name, total=sum(len(segment.images) for segment in segments)) as stage:
             for segment, folder in zip(segments, folders, strict=True):
                 if folder.is_done:
                     stage.skip(len(segment.images))
@@ -182,7 +178,7 @@ class FeedForwardBackbone:
     def _predict(self, segment: Segment, folder: StageFolder, stage: Stage) -> None:
         prediction = self.predictor.predict(segment, stage)
         for note in prediction.notes:
-            self.reporter.note(f"segment {segment.index}: {note}")
+            self.run.clock.note(f"segment {segment.index}: {note}")
         self._refuse_nonsense(prediction, segment)
         with folder.write() as written:
             _write(written, _checked(prediction, segment))
@@ -213,7 +209,7 @@ class FeedForwardBackbone:
         cameras = [self.collection.cameras[image.camera] for image in images]
         inputs = [(image.digest, image.camera, camera) for image, camera in zip(images, cameras, strict=True)]
         key = key_of("prediction", self.name, self.predictor.key, segment.images, inputs)
-        return self.run.stage("segments", f"{segment.index:04d}", self.name, key=key)
+        return self.run.folder.stage("segments", f"{segment.index:04d}", self.name, key=key)
 
 
 def _unit_rows(descriptors: npt.NDArray[np.floating], num_images: int) -> npt.NDArray[np.float32]:

@@ -162,15 +162,15 @@ def make_vggt(context: BackboneContext, options: VggtOptions) -> FeedForwardBack
             f"--backbone-options size={options.size}: needed a multiple of {PATCH_PX} px, by default {TRAINED_WIDTH_PX}"
         )
     if context.collection.calibrated:
-        context.reporter.warn("vggt predicts the cameras itself; the given calibration is not used")
+        context.run.clock.warn("vggt predicts the cameras itself; the given calibration is not used")
     predictor = VggtPredictor(
         context.collection,
         options.checkpoint,
         width=options.size,
         device=options.device,
-        reporter=context.reporter,
+        reporter=context.run.clock,
     )
-    return FeedForwardBackbone(predictor, context.collection, context.run, context.reporter)
+    return FeedForwardBackbone(predictor, context.collection, context.run)
 
 
 VGGT = BackbonePlugin(make=make_vggt, options=VggtOptions)

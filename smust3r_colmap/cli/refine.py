@@ -96,7 +96,8 @@ class Refine:
 
 def run_refine(command: Refine, reporter: Reporter) -> RunSummary:
     """Refine the model; errors leave as they are, see ``refine_model``."""
-    from smust3r_colmap.refine_model import CameraChoice, refine_model  # noqa: PLC0415  (--help shall not pay for it)
+    from smust3r_colmap.importers.stage import CameraChoice  # noqa: PLC0415  (--help shall not pay for it)
+    from smust3r_colmap.refine_model import refine_model  # noqa: PLC0415
 
     return refine_model(
         command.model,

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.geometry.sim3 import invert_rigid
-from smust3r_colmap.products import DenseMaps, PointCloud
+from smust3r_colmap.products import CloudStatistics, DenseMaps, PointCloud
 from smust3r_colmap.stitching.camera_fusion import FusedCameras, points_in_camera
 from smust3r_colmap.stitching.resection import PlacedSubmodel
 
@@ -34,23 +34,10 @@ _CELL_BITS = 21  # three axes of 21 bits fill an int64 without its sign
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FusedPoints:
-    """The cloud of a connected part, with counts of the pixels.
-
-    Args:
-        cloud: in the world frame, with normals.
-        voxel_size: edge of the cells that were averaged, in world units; NaN for an empty cloud.
-        num_pixels: confident pixels of all maps used.
-        num_samples: of these, gathered.
-        num_far: samples dropped because they lie more than a million voxels from the middle.
-        num_seen_once: voxels dropped because one image only saw them.
-    """
+    """The cloud of a connected part, in the world frame, with normals, and what became of the pixels."""
 
     cloud: PointCloud
-    voxel_size: float
-    num_pixels: int
-    num_samples: int
-    num_far: int
-    num_seen_once: int
+    statistics: CloudStatistics
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -154,11 +141,7 @@ def fuse_points(
             cloud=PointCloud(
                 xyz=np.empty((0, 3)), rgb=np.empty((0, 3), np.uint8), normals=np.empty((0, 3), np.float32)
             ),
-            voxel_size=np.nan,
-            num_pixels=0,
-            num_samples=0,
-            num_far=0,
-            num_seen_once=0,
+            statistics=CloudStatistics(voxel_size=np.nan, num_pixels=0, num_samples=0, num_far=0, num_seen_once=0),
         )
     near = _within_reach(samples.xyz, spacing)
     nearby = samples if near.all() else samples.selected(near)
@@ -166,11 +149,13 @@ def fuse_points(
     cloud, num_seen_once = _averaged(nearby, _cells(nearby.xyz, voxel_size), origin)
     return FusedPoints(
         cloud=cloud,
-        voxel_size=voxel_size,
-        num_pixels=num_pixels,
-        num_samples=len(samples),
-        num_far=len(samples) - len(nearby),
-        num_seen_once=num_seen_once,
+        statistics=CloudStatistics(
+            voxel_size=voxel_size,
+            num_pixels=num_pixels,
+            num_samples=len(samples),
+            num_far=len(samples) - len(nearby),
+            num_seen_once=num_seen_once,
+        ),
     )
 
 

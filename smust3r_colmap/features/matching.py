@@ -11,7 +11,7 @@ import pycolmap
 
 from smust3r_colmap.colmap.database import internal_name, open_database
 from smust3r_colmap.execution.progress import Stage
-from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks
+from smust3r_colmap.execution.task_pool import TaskFailure, TaskPool
 from smust3r_colmap.features.sift import logger
 from smust3r_colmap.geometry.arrays import Pair
 
@@ -52,10 +52,11 @@ def match_pairs(
         for k in range(0, len(missing), size)
     ]
     # One child with threads, not many children: SQLite takes one writer at a time.
-    for result in map_tasks(_match, tasks, workers=1, log_file=log_file):
-        if isinstance(result.value, TaskFailure):
-            logger.warning("up to %d pairs not matched: %s", len(tasks[result.index].pairs), result.value.reason)
-        stage.advance(len(tasks[result.index].pairs))
+    with TaskPool(workers=1, log_file=log_file) as child:
+        for result in child.map(_match, tasks):
+            if isinstance(result.value, TaskFailure):
+                logger.warning("up to %d pairs not matched: %s", len(tasks[result.index].pairs), result.value.reason)
+            stage.advance(len(tasks[result.index].pairs))
     with open_database(path) as database:
         return frozenset(pair for pair in wanted if database.exists_matches(pair[0] + 1, pair[1] + 1))
 

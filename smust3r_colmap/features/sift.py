@@ -19,7 +19,7 @@ import pycolmap
 
 from smust3r_colmap.colmap.database import open_database
 from smust3r_colmap.execution.progress import Stage
-from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks
+from smust3r_colmap.execution.task_pool import Executor, TaskFailure
 from smust3r_colmap.importers.images import load_grey
 from smust3r_colmap.importers.masks import load_mask
 from smust3r_colmap.products import ImageCollection, RejectedImage, SourceImage
@@ -50,8 +50,7 @@ def extract_features(
     *,
     max_image_size: int,
     max_features: int,
-    workers: int,
-    log_file: Path | None,
+    executor: Executor,
     stage: Stage,
 ) -> tuple[RejectedImage, ...]:
     """Extract SIFT for every image that has no keypoints yet; returns the images that failed.
@@ -68,7 +67,7 @@ def extract_features(
             _ExtractionTask(image=collection.images[i], max_image_size=max_image_size, max_features=max_features)
             for i in missing
         ]
-        for result in map_tasks(_extract, tasks, workers=workers, log_file=log_file):
+        for result in executor.map(_extract, tasks):
             index = missing[result.index]
             features = result.value
             if isinstance(features, TaskFailure):

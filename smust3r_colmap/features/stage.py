@@ -3,63 +3,105 @@ any backbone are made of. The next module to read is ``mapping``."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
-import numpy.typing as npt
 
 from smust3r_colmap.colmap.database import create_database, open_database
 from smust3r_colmap.config import ClassicalConfig
-from smust3r_colmap.execution.progress import Reporter
+from smust3r_colmap.execution.progress import Stage
+from smust3r_colmap.execution.run_context import Run
+from smust3r_colmap.features.matching import match_pairs
+from smust3r_colmap.features.pairs import alike_pairs, neighbouring_pairs
 from smust3r_colmap.features.sift import extract_features
 from smust3r_colmap.features.vlad import FEATURES_PER_IMAGE, vlad_descriptors
-from smust3r_colmap.products import ImageCollection, RunFeatures
-from smust3r_colmap.storage.run_directory import RunDirectory, key_of, read_arrays, write_arrays
+from smust3r_colmap.geometry.arrays import Float32Array, Pair
+from smust3r_colmap.products import ImageCollection, RunFeatures, Scene
+from smust3r_colmap.storage.codec import Codec
+from smust3r_colmap.storage.run_directory import key_of
+
+_DESCRIPTORS: Codec[Float32Array] = Codec(Float32Array, "descriptors")
 
 
-def features_of_run(
-    collection: ImageCollection,
-    config: ClassicalConfig,
-    run: RunDirectory,
-    reporter: Reporter,
-    *,
-    workers: int,
-    seed: int,
-) -> RunFeatures:
+def features_of_run(run: Run, collection: ImageCollection, options: ClassicalConfig) -> RunFeatures:
     """Extract what no earlier start extracted; a second call finds everything done."""
     images = [(image.digest, image.width, image.height, image.camera) for image in collection.images]
-    settings = (config.max_image_size, config.max_features, seed)
+    settings = (options.max_image_size, options.max_features, run.seed)
     masks = (collection.mask_digests,) if collection.mask_digests else ()
-    stored = run.stage("features", key=key_of("features", images, collection.cameras, *settings, *masks))
+    stored = run.folder.stage("features", key=key_of("features", images, collection.cameras, *settings, *masks))
     database = stored.open_in_place() / "database.db"
     create_database(database, collection)
-    with reporter.stage("features", total=len(collection)) as stage:
+    with run.clock.stage("features", total=len(collection)) as stage:
         rejected = extract_features(
             database,
             collection,
-            max_image_size=config.max_image_size,
-            max_features=config.max_features,
-            workers=workers,
-            log_file=run.native_log,
+            max_image_size=options.max_image_size,
+            max_features=options.max_features,
+            executor=run.executor,
             stage=stage,
         )
     for image in rejected:
-        reporter.warn(f"no features: {image.name} ({image.reason})")
+        run.clock.warn(f"no features: {image.name} ({image.reason})")
     lost = {image.name for image in rejected}
     usable = tuple(image.name not in lost for image in collection.images)
     return RunFeatures(database=database, key=stored.key, usable=usable, rejected=rejected)
 
 
-def describe_images(features: RunFeatures, run: RunDirectory, *, seed: int) -> npt.NDArray[np.float32]:
+def match_pairs_of_run(
+    run: Run, features: RunFeatures, pairs: Iterable[Pair], *, title: str = "matching"
+) -> frozenset[Pair]:
+    """Match and verify the pairs whose images have features; see ``match_pairs``."""
+    wanted = [(a, b) for a, b in pairs if features.usable[a] and features.usable[b]]
+    with run.clock.stage(title, total=len(wanted)) as stage:
+        return match_pairs(
+            features.database,
+            wanted,
+            workers=run.executor.workers,
+            seed=run.seed,
+            log_file=run.folder.native_log,
+            stage=stage,
+        )
+
+
+def describe_images(run: Run, features: RunFeatures) -> Float32Array:
     """(N, D) VLAD of the SIFT features of every image, of unit length; zero where an image has none."""
-    stage = run.stage("descriptors", key=key_of("descriptors", features.key, features.usable, seed))
-    if not stage.is_done:
+
+    def compute(progress: Stage) -> Float32Array:
         with open_database(features.database) as opened:
             numbers = range(1, len(features.usable) + 1)
             sift = [  # copies, for a slice would hold on to all features of the image
                 np.asarray(opened.read_descriptors(number).data).reshape(-1, 128)[:FEATURES_PER_IMAGE].copy()
                 for number in numbers
             ]
-        made = vlad_descriptors(sift, rng=np.random.default_rng(seed))
-        with stage.write() as folder:
-            write_arrays(folder / "descriptors.safetensors", {"vlad": made})
-    vlad: npt.NDArray[np.float32] = read_arrays(stage.path / "descriptors.safetensors")["vlad"]
-    return vlad
+        vlad = vlad_descriptors(sift, rng=np.random.default_rng(run.seed))
+        progress.advance()
+        return vlad
+
+    return run.cached("descriptors", (features.key, features.usable, run.seed), compute, _DESCRIPTORS)
+
+
+def match_external(
+    run: Run, collection: ImageCollection, scene: Scene, options: ClassicalConfig, *, per_image: int
+) -> RunFeatures:
+    """SIFT of all images, and the matches that no surface chooses, for a model of another program.
+
+    Those are of neighbours where the model has no points, and of images without a pose with those that look alike.
+
+    Args:
+        scene: of the model; its images are the first of the collection.
+        per_image: images that each of these is matched with.
+    """
+    features = features_of_run(run, collection, options)
+    pairs: set[Pair] = set()
+    if not len(scene.points):
+        pairs |= set(
+            neighbouring_pairs(scene.cam_from_world, per_image=per_image, exhaustive_below=options.exhaustive_below)
+        )
+    if len(scene) < len(collection):
+        descriptors = describe_images(run, features)
+        pairs |= set(
+            alike_pairs(descriptors, len(scene), per_image=per_image, exhaustive_below=options.exhaustive_below)
+        )
+    if pairs:
+        match_pairs_of_run(run, features, sorted(pairs))
+    return features

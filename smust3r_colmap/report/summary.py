@@ -1,7 +1,7 @@
 """What came out of a run, for people (``render_text``), programs (``to_json_dict``) and the shell.
 
-The pipeline fills a ``RunSummary`` at its end; nothing here measures or decides anything about
-geometry. The next module to read is ``cli``, which prints it.
+``summarise`` fills a ``RunSummary``; nothing here measures or decides anything about geometry. The next module to read
+is ``cli.console``, which prints it.
 """
 
 from __future__ import annotations
@@ -9,10 +9,20 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from smust3r_colmap.execution.progress import format_seconds
 from smust3r_colmap.execution.stage_clock import StageSummary
+
+if TYPE_CHECKING:  # the command line imports this module, and shall not load numpy for --help
+    from smust3r_colmap.alignment.stage import EdgeSummary
+    from smust3r_colmap.backbones.stage import SegmentSummary
+    from smust3r_colmap.exporters.registry import MissingOutput
+    from smust3r_colmap.products import CloudStatistics
+    from smust3r_colmap.stitching.stage import CameraFusionSummary, GraphSummary, LoopSummary
+
+SCHEMA_VERSION = 2
+"""Of ``summary.json``; raised when a name in it changes its meaning or goes."""
 
 EXIT_GOOD = 0
 EXIT_WEAK = 3
@@ -31,6 +41,8 @@ class ModelSummary:
         num_points: points of its fused cloud.
         metric: lengths are metres.
         segments: names of the submodels that were stitched.
+        cameras: how well the submodels agree on the cameras; None where nothing was stitched.
+        cloud: how the dense cloud came about; None where nothing was fused.
     """
 
     folder: str
@@ -38,6 +50,8 @@ class ModelSummary:
     num_points: int
     metric: bool
     segments: tuple[str, ...]
+    cameras: CameraFusionSummary | None
+    cloud: CloudStatistics | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,105 +60,6 @@ class ImageNote:
 
     name: str
     reason: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class SegmentSummary:
-    """What a backbone made of a segment.
-
-    Args:
-        index: of the segment in the plan.
-        kind: ``"window"`` or ``"loop"``.
-        num_images: images it was given.
-        num_submodels: connected submodels that came out; 0 when nothing did.
-        num_registered: images with a pose, over all its submodels.
-        method: how its largest submodel was made, in words; empty when nothing came out.
-        warnings: why its geometry should not be trusted.
-    """
-
-    index: int
-    kind: str
-    num_images: int
-    num_submodels: int
-    num_registered: int
-    method: str
-    warnings: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class EdgeSummary:
-    """An alignment between two submodels.
-
-    Args:
-        target, source: names of the submodels.
-        evidence: what it rests on: tracks, pointmaps, poses or matches.
-        relative_residual: median residual divided by depth; NaN when no transform was found.
-        accepted: it took part in the stitching.
-        reason: why it was refused, or empty.
-        fallback: why a smaller group than asked for was taken, or empty.
-    """
-
-    target: str
-    source: str
-    evidence: str
-    relative_residual: float
-    accepted: bool
-    reason: str = ""
-    fallback: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class LoopSummary:
-    """A place that the camera may have come back to, and what became of it.
-
-    Args:
-        image_a, image_b: names of the two images that look most alike.
-        similarity: cosine of their descriptors.
-        segment_a, segment_b: windows that hold them. segment: the loop segment.
-        accepted: it closes the loop in the result.
-        reason: why not, or empty.
-        closure_sigmas: how far the loop is from the chain of windows, in standard deviations per degree
-            of freedom; NaN where nothing else connects the two.
-        gap_before_percent, gap_after_percent: distance between where the two windows put the cameras of
-            the second end, joined through the loop, in percent of the extent of all cameras, without
-            and with loop closing; NaN where it cannot be told.
-        turn_before_deg, turn_after_deg: the same for their orientations.
-    """
-
-    image_a: str
-    image_b: str
-    similarity: float
-    segment_a: int
-    segment_b: int
-    segment: int
-    accepted: bool
-    reason: str
-    closure_sigmas: float
-    gap_before_percent: float
-    gap_after_percent: float
-    turn_before_deg: float
-    turn_after_deg: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class GraphSummary:
-    """The optimisation of all frames.
-
-    Args:
-        num_nodes, num_edges, num_loops: of the graph.
-        cost_before, cost_after: of the same objective; without loops and with one edge per pair, zero.
-        iterations, stop_reason: of the optimiser.
-        improved: its result was used; otherwise the chain was kept.
-    """
-
-    num_nodes: int
-    num_edges: int
-    num_loops: int
-    cost_before: float
-    cost_after: float
-    iterations: int
-    stop_reason: str
-    improved: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,7 +142,7 @@ class RunSummary:
         segments: in the order of the plan.
         edges: alignments that were tried.
         loops: that were planned. loops_note: why none could be looked for, or empty.
-        graph: the optimisation of the frames of all submodels.
+        graph: the optimisation of the frames of all submodels; None where nothing was stitched.
         peak_memory_bytes: largest resident size of this process or of one of its children.
         refinements: one per model; empty where none was wanted.
         missing_outputs: parts of the result that could not be written.
@@ -248,7 +163,7 @@ class RunSummary:
     edges: tuple[EdgeSummary, ...]
     loops: tuple[LoopSummary, ...]
     loops_note: str
-    graph: GraphSummary
+    graph: GraphSummary | None
     peak_memory_bytes: int
     refinements: tuple[RefinementSummary, ...] = ()
     missing_outputs: tuple[MissingOutput, ...] = ()
@@ -319,6 +234,7 @@ class RunSummary:
         """
         facts = asdict(self)
         del facts["output"]
+        facts["schema_version"] = SCHEMA_VERSION
         facts["scale"] = self.scale_statement
         facts["weak_reasons"] = list(self.weak_reasons)
         plain = _without_nan(facts)
@@ -400,11 +316,3 @@ def _without_nan(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
-
-
-@dataclass(frozen=True, kw_only=True)
-class MissingOutput:
-    """A part of the result that could not be written, and why."""
-
-    name: str
-    reason: str

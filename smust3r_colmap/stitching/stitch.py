@@ -7,6 +7,7 @@ together. Loops that the graph rejects are removed again. The next module to rea
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -48,6 +49,7 @@ class Stitching:
         chained: the window submodels along their spanning trees, loops left out.
         parts: the connected parts after the graph, loop submodels among their submodels.
         decisions: one per planned loop.
+        loop_weights: per planned loop, its weight in the pose graph; NaN where it took no part.
         gaps: per planned loop, its gap in ``chained`` and in ``parts``.
         solution: what the optimiser reports.
         num_edges: of the graph.
@@ -56,12 +58,13 @@ class Stitching:
     chained: tuple[ChainedPart, ...]
     parts: tuple[ChainedPart, ...]
     decisions: tuple[LoopDecision, ...]
+    loop_weights: tuple[float, ...]
     gaps: tuple[tuple[ClosureGap, ClosureGap], ...]
     solution: GraphSolution
     num_edges: int
 
 
-def stitch(
+def stitch_submodels(
     submodels: Sequence[Submodel],
     alignments: Sequence[SegmentAlignment],
     loops: Sequence[PlannedLoop],
@@ -105,10 +108,14 @@ def stitch(
         (closure_gap(one, submodels, alignments, chained), closure_gap(one, submodels, alignments, parts))
         for one in decisions
     )
+    loop_weights = [math.nan] * len(decisions)
+    for number, weight in zip(accepted, solution.loop_weights, strict=True):
+        loop_weights[number] = float(weight)
     return Stitching(
         chained=chained,
         parts=parts,
         decisions=tuple(decisions),
+        loop_weights=tuple(loop_weights),
         gaps=gaps,
         solution=solution,
         num_edges=len(graph),

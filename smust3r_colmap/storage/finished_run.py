@@ -21,16 +21,19 @@ from smust3r_colmap.storage.depth_maps import StoredDepthMaps
 from smust3r_colmap.storage.image_scan import store_scan
 from smust3r_colmap.storage.run_directory import (
     DATABASE_FILE,
+    IMPORT_STAGE,
     MODEL_FOLDER,
+    REFINED_STAGE,
+    SCENE_STAGE,
+    STITCHED_STAGE,
     RunDirectory,
     read_json,
     storage_errors,
     write_json,
 )
-from smust3r_colmap.storage.scenes import read_scenes
+from smust3r_colmap.storage.scenes import FUSED_SCENES
 
 FINISHED_FILE = "finished.json"
-SCENE_STAGE, STITCHED_STAGE, REFINED_STAGE, IMPORT_STAGE = "scene", "stitched", "refined", "import"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -130,7 +133,7 @@ def open_finished(run: RunDirectory, *, images: Path | None = None, output: Path
         output=run.root if output is None else output,
         native_log=run.native_log,
         images=images_then if images is None else images,
-        scenes=read_scenes(run.work / SCENE_STAGE),
+        scenes=tuple(one.scene for one in FUSED_SCENES.read(run.work / SCENE_STAGE)),
         models=tuple(refined / str(k) / MODEL_FOLDER if has else None for k, has in enumerate(with_tracks)),
         database=refined / DATABASE_FILE if any(with_tracks) else None,
         maps=StoredDepthMaps(run.work / STITCHED_STAGE) if with_maps else None,

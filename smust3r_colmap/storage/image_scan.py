@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from smust3r_colmap.importers.image_folder import FolderScan, ImportRecord, scan_image_folder
-from smust3r_colmap.storage.run_directory import RunDirectory, StageFolder, key_of, read_json, write_json
+from smust3r_colmap.storage.run_directory import IMPORT_STAGE, RunDirectory, StageFolder, key_of, read_json, write_json
 
 
 def scan_changed_files(images: Path, run: RunDirectory, *, overwrite: bool, workers: int) -> FolderScan:
@@ -25,4 +25,4 @@ def store_scan(scan: FolderScan, run: RunDirectory) -> None:
 
 
 def _stage(run: RunDirectory) -> StageFolder:
-    return run.stage("import", key=key_of("import"))
+    return run.stage(IMPORT_STAGE, key=key_of(IMPORT_STAGE))

@@ -51,7 +51,10 @@ from filelock import FileLock, Timeout
 from smust3r_colmap.errors import RunDirectoryError, RunLockedError, StorageError
 from smust3r_colmap.storage.atomic_write import write_atomically
 
+IMPORT_STAGE, STITCHED_STAGE, REFINED_STAGE, SCENE_STAGE = "import", "stitched", "refined", "scene"
+"""Folders below ``work`` that are read again when a finished run is exported."""
 MODEL_FOLDER, DATABASE_FILE = "model", "database.db"
+"""Of the refinement: the model of each scene, and the database that goes with all of them."""
 
 FORMAT_VERSION = 2
 """Part of every key; a change of what a stage stores or computes raises it."""

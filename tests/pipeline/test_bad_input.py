@@ -20,7 +20,7 @@ from smust3r_colmap.geometry.arrays import Float32Array
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.products import DenseMaps, Segment, SegmentAlignment, SegmentReconstruction, Submodel
 from smust3r_colmap.segmentation.loop_segments import PlannedLoop
-from smust3r_colmap.stitching.stitch import stitch
+from smust3r_colmap.stitching.stitch import stitch_submodels
 from smust3r_colmap.synthetic.backbone import OracleBackbone
 from smust3r_colmap.synthetic.settings import PRESETS, OracleSettings
 from smust3r_colmap.synthetic.truth import TrueScene, collection_of
@@ -328,7 +328,7 @@ def test_trusted_edges_that_contradict_each_other_end_in_a_finite_compromise(tru
     alignments = list(solved.edges.alignments)
     position = next(k for k, edge in enumerate(alignments) if edge.source - edge.target == 2)
     alignments[position] = _turned(alignments[position])
-    found = stitch(run.result.submodels, alignments, (), group=Sim3, kernel="cauchy")
+    found = stitch_submodels(run.result.submodels, alignments, (), group=Sim3, kernel="cauchy")
     assert found.solution.cost_after < found.solution.cost_before
     assert found.solution.cost_after > 10 * solved.stitching.solution.cost_after
     (part,) = found.parts

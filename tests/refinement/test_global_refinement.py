@@ -45,6 +45,7 @@ from smust3r_colmap.errors import ConfigError
 from smust3r_colmap.execution.progress import QuietReporter, Stage
 from smust3r_colmap.execution.stage_clock import StageClock
 from smust3r_colmap.execution.task_pool import TaskResult
+from smust3r_colmap.features.seen_surfaces import surfaces_of_clouds
 from smust3r_colmap.geometry.arrays import FloatArray, Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import ImageCollection, PointCloud, RunFeatures, Scene
@@ -54,7 +55,7 @@ from smust3r_colmap.refinement import stage as refine
 from smust3r_colmap.refinement.bundle_adjustment import ENOUGH_OBSERVATIONS, MANY_OBSERVATIONS, figures_of
 from smust3r_colmap.refinement.global_refinement import RefinedFigures, RefineTask, refine_scenes
 from smust3r_colmap.refinement.mapper import Bench
-from smust3r_colmap.refinement.stage import Refinement, surfaces_of_clouds
+from smust3r_colmap.refinement.stage import Refinement
 from smust3r_colmap.storage.run_directory import RunDirectory, StageFolder, read_json
 
 pytestmark = pytest.mark.usefixtures("quiet_pycolmap")

@@ -25,11 +25,11 @@ from smust3r_colmap.products import (
     TransformEstimate,
 )
 from smust3r_colmap.segmentation.loop_segments import PlannedLoop
-from smust3r_colmap.stitching import stitch as stitching
+from smust3r_colmap.stitching import stitch_submodels as stitching
 from smust3r_colmap.stitching.loop_verification import LoopDecision, UncertainTransform, covariance_of
 from smust3r_colmap.stitching.pose_graph.graph import PoseGraph
 from smust3r_colmap.stitching.pose_graph.optimise import GraphSolution, optimise
-from smust3r_colmap.stitching.stitch import ClosureGap, Stitching, closure_gap, stitch
+from smust3r_colmap.stitching.stitch import ClosureGap, Stitching, closure_gap, stitch_submodels
 from smust3r_colmap.storage.dense_maps import EmptyMaps
 
 NUM_IMAGES, LENGTH, STEP = 96, 16, 8
@@ -132,7 +132,7 @@ class Ring:
                 self.add_edge(window, self.add_submodel(end, segment.index))
 
     def stitched(self) -> Stitching:
-        return stitch(self.submodels, self.edges, self.loops, group=Sim3, kernel="cauchy")
+        return stitch_submodels(self.submodels, self.edges, self.loops, group=Sim3, kernel="cauchy")
 
     def error(self, stitching: Stitching, *, closed: bool) -> float:
         """Root mean square distance of all window cameras from the truth, the first submodel held."""
@@ -259,7 +259,7 @@ def test_two_edges_of_a_pair_are_averaged_by_their_information() -> None:
         estimate=replace(first.estimate, b_from_a=first.estimate.b_from_a @ shifted),
         information=first.information / 2,
     )
-    found = stitch(ring.submodels[:2], [first, second], [], group=Sim3, kernel="cauchy")
+    found = stitch_submodels(ring.submodels[:2], [first, second], [], group=Sim3, kernel="cauchy")
     between = first.estimate.b_from_a.inverse() @ found.parts[0].world_from_seg[1]
     np.testing.assert_allclose(between.log(), [0.001, 0, 0, 0, 0, 0, 0], atol=1e-6)
 
@@ -316,7 +316,7 @@ def test_the_gap_of_a_camera_that_only_turns_has_no_distance() -> None:
     submodels = [replace(submodel, seg_from_cam=submodel.seg_from_cam * [1, 1, 1, 0]) for submodel in ring.submodels]
     same = [replace(edge.estimate, b_from_a=Sim3.identity()) for edge in ring.edges]
     edges = [replace(edge, estimate=estimate) for edge, estimate in zip(ring.edges, same, strict=True)]
-    (part,) = stitch(submodels[:-1], edges[:-2], [], group=Sim3, kernel="none").chained
+    (part,) = stitch_submodels(submodels[:-1], edges[:-2], [], group=Sim3, kernel="none").chained
     decision = LoopDecision(submodel=11, accepted=True, edges=(10, 11))
     assert np.isnan(closure_gap(decision, submodels, edges, [part]).distance)
 

@@ -28,11 +28,11 @@ from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
 from smust3r_colmap.backbones.options import NoOptions
 from smust3r_colmap.colmap.database import open_database
 from smust3r_colmap.config import ClassicalConfig
-from smust3r_colmap.execution.progress import Reporter, Stage
-from smust3r_colmap.execution.task_pool import TaskFailure, TaskPool
-from smust3r_colmap.features.matching import match_pairs
+from smust3r_colmap.execution.progress import Stage
+from smust3r_colmap.execution.run_context import Run
+from smust3r_colmap.execution.task_pool import TaskFailure
 from smust3r_colmap.features.pairs import plan_loop_pairs, plan_pairs
-from smust3r_colmap.features.stage import describe_images, features_of_run
+from smust3r_colmap.features.stage import describe_images, features_of_run, match_pairs_of_run
 from smust3r_colmap.geometry.arrays import Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import (
@@ -47,7 +47,7 @@ from smust3r_colmap.products import (
     UnregisteredImage,
 )
 from smust3r_colmap.storage.dense_maps import EmptyMaps, StoredMaps
-from smust3r_colmap.storage.run_directory import RunDirectory, StageFolder, key_of
+from smust3r_colmap.storage.run_directory import StageFolder, key_of
 
 logger = logging.getLogger(__name__)
 
@@ -60,44 +60,27 @@ class ClassicalBackbone:
     Args:
         collection: the images of the run.
         config: settings of the backbone.
-        run: where finished work is kept.
-        reporter: told about every stage.
-        workers: processes, at least one.
-        seed: of every sampler.
+        run: where finished work is kept, and how tasks run.
     """
 
     name = "classical"
     metric = False
     has_tracks = True
 
-    def __init__(
-        self,
-        collection: ImageCollection,
-        config: ClassicalConfig,
-        run: RunDirectory,
-        reporter: Reporter,
-        *,
-        workers: int,
-        seed: int,
-    ) -> None:
+    def __init__(self, collection: ImageCollection, config: ClassicalConfig, run: Run) -> None:
         self.collection = collection
         self.config = config
         self.run = run
-        self.reporter = reporter
-        self.workers = workers
-        self.seed = seed
 
     def describe(self) -> npt.NDArray[np.float32]:
         """VLAD of the SIFT features of every image; see ``Backbone``."""
-        return describe_images(self._features, self.run, seed=self.seed)
+        return describe_images(self.run, self._features)
 
     def reconstruct(self, segments: Sequence[Segment], *, with_maps: Collection[int]) -> BackboneResult:
         """All segments of the run; see ``Backbone``."""
         pairs = self._match(segments)
-        with TaskPool(workers=self.workers, log_file=self.run.native_log) as pool:
-            mapped = self._map(segments, pairs, pool)
-            reconstructions = [_reconstruction(one) for one in mapped]
-            dense, dense_key = self._dense([p for r in reconstructions for p in r.submodels], with_maps, pool)
+        reconstructions = [_reconstruction(one) for one in self._map(segments, pairs)]
+        dense, dense_key = self._dense([p for r in reconstructions for p in r.submodels], with_maps)
         return BackboneResult(
             reconstructions=tuple(reconstructions),
             dense=dense,
@@ -110,28 +93,14 @@ class ClassicalBackbone:
     # ------------------------------------------------------------- once in the run
     @cached_property
     def _features(self) -> RunFeatures:
-        return features_of_run(
-            self.collection, self.config, self.run, self.reporter, workers=self.workers, seed=self.seed
-        )
+        return features_of_run(self.run, self.collection, self.config)
 
     def _match(self, segments: Sequence[Segment]) -> dict[int, tuple[Pair, ...]]:
         """The matched pairs by segment. Pairs that failed are in no key, so what comes later is not final either."""
-        usable = self._features.usable
         descriptors = self.describe() if any(segment.kind == "loop" for segment in segments) else None
-        plan = {
-            segment.index: [(a, b) for a, b in self._pairs(segment, descriptors) if usable[a] and usable[b]]
-            for segment in segments
-        }
+        plan = {segment.index: self._pairs(segment, descriptors) for segment in segments}
         every_pair = {pair for pairs in plan.values() for pair in pairs}
-        with self.reporter.stage("matching", total=len(every_pair)) as stage:
-            matched = match_pairs(
-                self._features.database,
-                every_pair,
-                workers=self.workers,
-                seed=self.seed,
-                log_file=self.run.native_log,
-                stage=stage,
-            )
+        matched = match_pairs_of_run(self.run, self._features, every_pair)
         return {index: tuple(pair for pair in pairs if pair in matched) for index, pairs in plan.items()}
 
     def _pairs(self, segment: Segment, descriptors: npt.NDArray[np.float32] | None) -> tuple[Pair, ...]:
@@ -142,18 +111,16 @@ class ClassicalBackbone:
         return plan_pairs(segment, neighbours=neighbours, exhaustive_below=self.config.exhaustive_below)
 
     # --------------------------------------------------------------- every segment
-    def _map(
-        self, segments: Sequence[Segment], pairs: Mapping[int, tuple[Pair, ...]], pool: TaskPool
-    ) -> list[MappedSegment]:
+    def _map(self, segments: Sequence[Segment], pairs: Mapping[int, tuple[Pair, ...]]) -> list[MappedSegment]:
         """Map pilots freely, agree on the cameras, map the other segments with these, bring the pilots to them.
 
         Windows alone have a say about the cameras, so a loop that is found later changes no window.
         """
         tasks = {segment.index: self._mapping_task(segment, pairs[segment.index]) for segment in segments}
         if self.collection.calibrated:
-            mapped = self._map_all("mapping", list(tasks.values()), pool)
+            mapped = self._map_all("mapping", list(tasks.values()))
             return [mapped[segment.index] for segment in segments]
-        mapped = self._map_pilots([tasks[segment.index] for segment in segments if segment.kind == "window"], pool)
+        mapped = self._map_pilots([tasks[segment.index] for segment in segments if segment.kind == "window"])
         known = self._agreed_cameras(segments, mapped)
         rest = [
             replace(tasks[segment.index], trusted=known[segment.kind])
@@ -161,13 +128,13 @@ class ClassicalBackbone:
             if segment.index not in mapped
         ]
         if rest:
-            found = self._map_known(rest, list(mapped.values()), pool)
+            found = self._map_known(rest, list(mapped.values()))
             tasks |= {task.segment: task for task, _ in found}
             mapped |= {one.segment: one for _, one in found}
         free = {index: one for index, one in mapped.items() if one.models and not tasks[index].calibrated}
         agreed = self._agreed_cameras(segments, free)
         for camera, intrinsics in (agreed["window"] | known["window"]).items():
-            self.reporter.note(
+            self.run.clock.note(
                 f"camera {camera + 1}: the segments agree on a focal length of {intrinsics.focal_px:.1f} px"
             )
         calibrations = [
@@ -179,64 +146,62 @@ class ClassicalBackbone:
             for segment in segments
             if segment.index in free
         ]
-        mapped |= self._calibrate_all(calibrations, pool)
+        mapped |= self._calibrate_all(calibrations)
         return [mapped[segment.index] for segment in segments]
 
-    def _map_pilots(self, windows: Sequence[MappingTask], pool: TaskPool) -> dict[int, MappedSegment]:
+    def _map_pilots(self, windows: Sequence[MappingTask]) -> dict[int, MappedSegment]:
         """Freely mapped windows, by segment: a few where these agree on the cameras, otherwise all."""
         pilots = choose_pilots(windows)
-        mapped = self._map_all("mapping", pilots, pool)
+        mapped = self._map_all("mapping", pilots)
         rest = [task for task in windows if task.segment not in mapped]
         cameras = {camera for task in rest for camera in task.camera_indices}
         if not are_certain(cameras, list(mapped.values()), [image.camera for image in self.collection.images]):
-            mapped |= self._map_all("mapping of more windows", rest, pool)
+            mapped |= self._map_all("mapping of more windows", rest)
         return mapped
 
     def _map_known(
-        self, tasks: Sequence[MappingTask], pilots: Sequence[MappedSegment], pool: TaskPool
+        self, tasks: Sequence[MappingTask], pilots: Sequence[MappedSegment]
     ) -> list[tuple[MappingTask, MappedSegment]]:
         """Segments mapped with the cameras found, but freely where these do not fit; each with the task that stands."""
-        mapped = self._map_all("mapping with the cameras found", tasks, pool)
+        mapped = self._map_all("mapping with the cameras found", tasks)
         chosen = {task.segment: (task, mapped[task.segment]) for task in tasks}
         doubtful = misfits(list(mapped.values()), pilots)
         if doubtful:
             again = [replace(task, trusted={}) for task in tasks if task.segment in doubtful]
-            freely = self._map_all("mapping where these do not fit", again, pool, folder="mapping_free")
+            freely = self._map_all("mapping where these do not fit", again, folder="mapping_free")
             for task in again:
                 if is_better(freely[task.segment], mapped[task.segment]):
                     chosen[task.segment] = (task, freely[task.segment])
         return list(chosen.values())
 
-    def _map_all(
-        self, name: str, tasks: Sequence[MappingTask], pool: TaskPool, *, folder: str = "mapping"
-    ) -> dict[int, MappedSegment]:
+    def _map_all(self, name: str, tasks: Sequence[MappingTask], *, folder: str = "mapping") -> dict[int, MappedSegment]:
         """What the mappers make of segments, by segment; where they bring the process down, without the global one."""
         folders = [self._segment_stage(task.segment, folder, self._mapping_key(task)) for task in tasks]
-        with self.reporter.stage(name, total=len(tasks)) as stage:
-            mapped = self._finish(map_segment, tasks, folders, [_nothing(task) for task in tasks], stage, pool)
+        with self.run.clock.stage(name, total=len(tasks)) as stage:
+            mapped = self._finish(map_segment, tasks, folders, [_nothing(task) for task in tasks], stage)
         crashed = [k for k, one in enumerate(mapped) if not one.models and not folders[k].is_done]
         if crashed:
-            with self.reporter.stage("mapping without the global mapper", total=len(crashed)) as stage:
+            with self.run.clock.stage("mapping without the global mapper", total=len(crashed)) as stage:
                 careful = [replace(tasks[k], use_global=False) for k in crashed]
                 again = self._finish(
-                    map_segment, careful, [folders[k] for k in crashed], [mapped[k] for k in crashed], stage, pool
+                    map_segment, careful, [folders[k] for k in crashed], [mapped[k] for k in crashed], stage
                 )
             for k, one in zip(crashed, again, strict=True):
                 mapped[k] = one
         return {one.segment: one for one in mapped}
 
-    def _calibrate_all(self, tasks: Sequence[CalibrationTask], pool: TaskPool) -> dict[int, MappedSegment]:
+    def _calibrate_all(self, tasks: Sequence[CalibrationTask]) -> dict[int, MappedSegment]:
         """Freely mapped segments brought to the agreed cameras, by segment."""
         keys = [key_of("calibrated", self._mapping_key(task.mapping), sorted(task.agreed.items())) for task in tasks]
         folders = [
             self._segment_stage(task.mapping.segment, "calibrated", key) for task, key in zip(tasks, keys, strict=True)
         ]
-        with self.reporter.stage("calibration", total=len(tasks)) as stage:
-            calibrated = self._finish(calibrate_segment, tasks, folders, [task.mapped for task in tasks], stage, pool)
+        with self.run.clock.stage("calibration", total=len(tasks)) as stage:
+            calibrated = self._finish(calibrate_segment, tasks, folders, [task.mapped for task in tasks], stage)
         return {one.segment: one for one in calibrated}
 
     def _mapping_key(self, task: MappingTask) -> str:
-        inputs = (self._features.key, self.seed, task.images, task.pairs, sorted(task.trusted.items()))
+        inputs = (self._features.key, self.run.seed, task.images, task.pairs, sorted(task.trusted.items()))
         return key_of("mapping", METHOD_VERSION, *inputs)
 
     def _agreed_cameras(
@@ -263,7 +228,7 @@ class ClassicalBackbone:
             pairs=pairs,
             cameras=self.collection.cameras,
             trusted=dict(enumerate(self.collection.cameras)) if self.collection.calibrated else {},
-            seed=self.seed,
+            seed=self.run.seed,
         )
 
     def _finish(
@@ -273,7 +238,6 @@ class ClassicalBackbone:
         folders: Sequence[StageFolder],
         otherwise: Sequence[MappedSegment],
         stage: Stage,
-        pool: TaskPool,
     ) -> list[MappedSegment]:
         """Run what no earlier start finished, store it, and return everything in order.
 
@@ -284,7 +248,7 @@ class ClassicalBackbone:
         stage.skip(len(tasks) - len(missing))
         failed = {}
         todo = [tasks[k] for k in missing]
-        for result in pool.map(function, todo):
+        for result in self.run.executor.map(function, todo):
             k = missing[result.index]
             if isinstance(result.value, TaskFailure):
                 failed[k] = _with_failure(otherwise[k], folders[k].path.name, result.value)
@@ -295,20 +259,18 @@ class ClassicalBackbone:
             stage.advance()
         return [failed[k] if k in failed else read_mapped(folder.path) for k, folder in enumerate(folders)]
 
-    def _dense(
-        self, submodels: Sequence[Submodel], with_maps: Collection[int], pool: TaskPool
-    ) -> tuple[tuple[DenseMaps, ...], str]:
+    def _dense(self, submodels: Sequence[Submodel], with_maps: Collection[int]) -> tuple[tuple[DenseMaps, ...], str]:
         """Maps of every submodel and their common key; a submodel whose sweep failed gets empty ones and a warning."""
         tasks = [self._depth_task(submodel) for submodel in submodels]
         wanted = [task for task in tasks if task.submodel.segment in with_maps]
         missing = [task for task in wanted if not task.folder.is_done]
         total = sum(len(task.images) for task in wanted)
-        with self.reporter.stage("depth", total=total) as stage:
+        with self.run.clock.stage("depth", total=total) as stage:
             stage.skip(total - sum(len(task.images) for task in missing))
-            for result in pool.map(make_depth, missing):
+            for result in self.run.executor.map(make_depth, missing):
                 task = missing[result.index]
                 if isinstance(result.value, TaskFailure):
-                    self.reporter.warn(f"segment {task.submodel.name} has no depth maps: {result.value.reason}")
+                    self.run.clock.warn(f"segment {task.submodel.name} has no depth maps: {result.value.reason}")
                 stage.advance(len(task.images))
         done = [task.submodel.segment in with_maps and task.folder.is_done for task in tasks]
         maps: tuple[DenseMaps, ...] = tuple(
@@ -332,7 +294,7 @@ class ClassicalBackbone:
         )
 
     def _segment_stage(self, segment: int, name: str, key: str) -> StageFolder:
-        return self.run.stage("segments", f"{segment:04d}", name, key=key)
+        return self.run.folder.stage("segments", f"{segment:04d}", name, key=key)
 
 
 def _nothing(task: MappingTask) -> MappedSegment:
@@ -395,9 +357,6 @@ def make_classical(context: BackboneContext, options: NoOptions) -> ClassicalBac
         context.collection,
         context.config.classical,
         context.run,
-        context.reporter,
-        workers=context.workers,
-        seed=context.config.seed,
     )
 
 

@@ -111,12 +111,12 @@ def make_must3r(context: BackboneContext, options: NoOptions) -> FeedForwardBack
         retrieval=named_file(head, said_by="--retrieval-weights", kind="retrieval head") if head else None,
         device=device,
         precision=choose_precision(settings.precision, device),
-        token_folder=context.run.work / "tokens",
-        reporter=context.reporter,
-        threads=context.workers,
+        token_folder=context.run.folder.work / "tokens",
+        reporter=context.run.clock,
+        threads=context.run.executor.workers,
     )
     _warn_of_narrow_views(context, settings.network_size)
-    return FeedForwardBackbone(predictor, context.collection, context.run, context.reporter)
+    return FeedForwardBackbone(predictor, context.collection, context.run)
 
 
 MUST3R = BackbonePlugin(make=make_must3r, options=NoOptions)
@@ -131,7 +131,7 @@ def _warn_of_narrow_views(context: BackboneContext, size: int) -> None:
     narrow = {name: share for name, share in shares.items() if share < MIN_SEEN_SHARE}
     if narrow:
         name, share = min(narrow.items(), key=lambda item: item[1])
-        context.reporter.warn(
+        context.run.clock.warn(
             f"MUSt3R sees the middle of {len(narrow)} of {len(shares)} images only, such as {share:.0%} of {name}"
         )
 
