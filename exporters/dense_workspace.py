@@ -35,7 +35,7 @@ from PIL import ExifTags, Image
 
 from smust3r_colmap.dense.depth_consistency import ModelDepth, depth_of_model
 from smust3r_colmap.errors import ImageError, InputError, ReconstructionError, StorageError
-from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks, usable_cores
+from smust3r_colmap.execution.task_pool import TaskFailure, in_child, usable_cores
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.importers.images import inspect, load_rgb
 from smust3r_colmap.products import DepthMaps, SourceImage
@@ -258,7 +258,7 @@ def _undistort(
     task = _UndistortionTask(
         model=inputs / "model", images=images.resolve(), output=partial.resolve(), longer_side=longer_side
     )
-    _in_child(_run_undistortion, task, "undistortion", log_file)
+    _in_child_or_raise(_run_undistortion, task, "undistortion", log_file)
     shutil.rmtree(inputs)
     undistorted = pycolmap.Reconstruction(partial / "sparse")
     if undistorted.num_reg_images() != len(sources):
@@ -443,7 +443,7 @@ def _fuse(workspace: Path, written: list[_WrittenMap], memory_gib: float, log_fi
     cameras = workspace / "sparse/cameras.bin"
     true_cameras = cameras.read_bytes()
     _write_cameras_for_fusion(workspace / "sparse")
-    num_points = _in_child(_run_fusion, task, "stereo fusion", log_file)
+    num_points = _in_child_or_raise(_run_fusion, task, "stereo fusion", log_file)
     cameras.write_bytes(true_cameras)
     vertex_bytes = 6 * 4 + 3  # place, normal, colour
     arrived = (workspace / "fused.ply").stat().st_size
@@ -478,9 +478,9 @@ def _run_fusion(task: _FusionTask) -> int:
     return int(fused.num_points3D())
 
 
-def _in_child(function: Callable[[TaskT], ResultT], task: TaskT, what: str, log_file: Path | None) -> ResultT:
+def _in_child_or_raise(function: Callable[[TaskT], ResultT], task: TaskT, what: str, log_file: Path | None) -> ResultT:
     """Run native code where it cannot take us along."""
-    (result,) = map_tasks(function, [task], workers=1, log_file=log_file)
-    if isinstance(result.value, TaskFailure):
-        raise ReconstructionError(f"{what} of the dense workspace failed: {result.value.reason}")
-    return result.value
+    result = in_child(function, task, log_file=log_file)
+    if isinstance(result, TaskFailure):
+        raise ReconstructionError(f"{what} of the dense workspace failed: {result.reason}")
+    return result

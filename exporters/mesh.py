@@ -29,7 +29,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from smust3r_colmap.errors import InputError, MissingDependencyError, ReconstructionError, advice_for
-from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks
+from smust3r_colmap.execution.task_pool import TaskFailure, in_child
 from smust3r_colmap.geometry.arrays import BoolArray, FloatArray, IntArray, UInt8Array
 from smust3r_colmap.geometry.camera import pixel_centres
 from smust3r_colmap.storage.atomic_write import write_atomically
@@ -139,12 +139,12 @@ def write_mesh(workspace: Path, method: MeshMethod, *, log_file: Path | None = N
     num_points = len(_read_cloud(workspace)[0])
     if num_points < MIN_POINTS:
         raise InputError(f"{workspace / 'fused.ply'}: {num_points} points, a mesh needs at least {MIN_POINTS}")
-    (result,) = map_tasks(_make_mesh, [_MeshTask(workspace=workspace, method=method)], workers=1, log_file=log_file)
-    if isinstance(result.value, TaskFailure):
-        raise ReconstructionError(f"the {method} mesh failed: {result.value.reason}")
-    if isinstance(result.value, _NoOpen3D):
-        raise MissingDependencyError(f"a mesh needs open3d: {result.value.advice}")
-    return result.value
+    report = in_child(_make_mesh, _MeshTask(workspace=workspace, method=method), log_file=log_file)
+    if isinstance(report, TaskFailure):
+        raise ReconstructionError(f"the {method} mesh failed: {report.reason}")
+    if isinstance(report, _NoOpen3D):
+        raise MissingDependencyError(f"a mesh needs open3d: {report.advice}")
+    return report
 
 
 def _make_mesh(task: _MeshTask) -> MeshReport | _NoOpen3D:

@@ -51,9 +51,10 @@ from smust3r_colmap.evaluation.trajectory import Evaluation, Trajectory, compare
 from smust3r_colmap.execution.progress import QuietReporter
 from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.sim3 import invert_rigid
-from smust3r_colmap.pipeline import NOT_LOOKED_FOR, reconstruct
+from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.products import Edges, Segment
 from smust3r_colmap.segmentation.loop_segments import LoopPlan, PlannedLoop, plan_loops
+from smust3r_colmap.segmentation.stage import NOT_LOOKED_FOR
 from smust3r_colmap.segmentation.windows import plan_windows
 from smust3r_colmap.stitching.camera_fusion import fuse_cameras
 from smust3r_colmap.stitching.resection import PlacedSubmodel, place_submodel

@@ -199,14 +199,6 @@ def in_child(
     return result.value
 
 
-def map_tasks(
-    function: Callable[[TaskT], ResultT], tasks: Sequence[TaskT], *, workers: int, log_file: Path | None = None
-) -> Iterator[TaskResult[ResultT]]:
-    """One batch of tasks in child processes of its own; see ``TaskPool``."""
-    with TaskPool(workers=min(workers, len(tasks)), log_file=log_file) as pool:
-        yield from pool.map(function, tasks)
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Report(Generic[ResultT]):
     """What a child sends back: the outcome, its process id, and its processor time so far."""

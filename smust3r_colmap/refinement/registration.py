@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks
+from smust3r_colmap.execution.task_pool import TaskFailure, in_child
 from smust3r_colmap.refinement.acceptance import (
     MAX_LOST,
     StepReport,
@@ -88,9 +88,9 @@ def complete_model(
         task.model.mkdir()
         task.output.mkdir()
         model.write_binary(task.model)
-        (result,) = map_tasks(_map_on, [task], workers=1)
-        if isinstance(result.value, TaskFailure):
-            return _nothing_added(model, before, f"COLMAP's mapper failed: {result.value.reason}")
+        failure = in_child(_map_on, task)
+        if isinstance(failure, TaskFailure):
+            return _nothing_added(model, before, f"COLMAP's mapper failed: {failure.reason}")
         completed = pycolmap.Reconstruction(task.output)
     _put_back_lost_images(completed, model)
     _give_up_doubtful_images(completed, model, agrees)

@@ -22,7 +22,7 @@ from smust3r_colmap.colmap.reconstruction import cameras_of, poses_of
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.evaluation.readers import read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
-from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks
+from smust3r_colmap.execution.task_pool import TaskFailure, in_child
 from smust3r_colmap.features.guided_verification import (
     MIN_CONSENT,
     MIN_MATCHES,
@@ -156,11 +156,11 @@ def _mapped_anew(
             j_from_i={},
             priors=(),
         )
-        (result,) = map_tasks(_map_globally, [task], workers=1)
-        if isinstance(result.value, TaskFailure):
-            logger.warning("the global mapper failed on %d bent images: %s", len(bent), result.value.reason)
+        mapped = in_child(_map_globally, task)
+        if isinstance(mapped, TaskFailure):
+            logger.warning("the global mapper failed on %d bent images: %s", len(bent), mapped.reason)
             return {}
-        if not result.value:
+        if not mapped:
             return {}
         anew = read_reference_sparse(task.output)
     return _in_world_of(poses, anew, bent, [image.name for image in bench.collection.images])

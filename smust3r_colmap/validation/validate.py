@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from smust3r_colmap.errors import StorageError
-from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks
+from smust3r_colmap.execution.task_pool import TaskFailure, in_child
 from smust3r_colmap.validation import (
     binary_files,
     checks_cameras,
@@ -198,8 +198,8 @@ def _num_images(folder: Path) -> int:
 
 def _ask_colmap(folder: Path) -> str:
     """What pycolmap says against the model, which it reads in a process of its own; empty when nothing."""
-    (result,) = map_tasks(_load_with_pycolmap, [str(folder)], workers=1)
-    return result.value.reason if isinstance(result.value, TaskFailure) else ""
+    failure = in_child(_load_with_pycolmap, str(folder))
+    return failure.reason if isinstance(failure, TaskFailure) else ""
 
 
 def _load_with_pycolmap(folder: str) -> None:

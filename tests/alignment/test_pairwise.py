@@ -11,7 +11,7 @@ from smust3r_colmap.geometry.affine3 import Affine3
 from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.products import Edges, InterSegmentMatches, Submodel
-from smust3r_colmap.storage.alignments import read_edges, write_edges
+from smust3r_colmap.storage.codec import Codec
 
 
 class Counter:
@@ -126,8 +126,9 @@ def test_only_submodels_that_could_meet_are_tried() -> None:
 def test_edges_come_back_from_disk_as_they_were(tmp_path) -> None:  # type: ignore[no-untyped-def]
     a, b, _ = two_submodels(range(12), range(6, 18))
     edges = align(a, b, edges="both")
-    write_edges(tmp_path, edges)
-    back = read_edges(tmp_path)
+    codec: Codec[Edges] = Codec(Edges, "edges")
+    codec.write(tmp_path, edges)
+    back = codec.read(tmp_path)
     assert len(back.alignments) == len(edges.alignments) == 2
     for found, wanted in zip(back.alignments, edges.alignments, strict=True):
         np.testing.assert_allclose(found.estimate.b_from_a.matrix, wanted.estimate.b_from_a.matrix, rtol=1e-14)

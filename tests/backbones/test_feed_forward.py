@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from helpers.room_network import install_package, pinhole
+from helpers.runs import quiet_run
 
 from smust3r_colmap.backbones.base import Backbone, BackboneResult
 from smust3r_colmap.backbones.feed_forward import (
@@ -32,7 +33,6 @@ from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.products import ImageCollection, Segment, SourceImage, UnregisteredImage
 from smust3r_colmap.report.summary import RunSummary
 from smust3r_colmap.storage.dense_maps import ImageMaps
-from smust3r_colmap.storage.run_directory import RunDirectory
 from smust3r_colmap.synthetic.room import write_demo
 
 WIDTH, HEIGHT, NUM_IMAGES = 40, 30, 6
@@ -123,9 +123,9 @@ def start(
     folder: Path, network: CountingNetwork, *segments: Segment, collection: ImageCollection | None = None
 ) -> BackboneResult:
     """One start of a run that lies in ``folder``."""
-    with RunDirectory(folder) as run:
+    with quiet_run(folder, Heard()) as run:
         predictor: Predictor = network
-        backbone: Backbone = FeedForwardBackbone(predictor, collection or photographs(), run, Heard())
+        backbone: Backbone = FeedForwardBackbone(predictor, collection or photographs(), run)
         return backbone.reconstruct(segments or (WINDOW,), with_maps=())
 
 
@@ -152,9 +152,9 @@ def test_a_prediction_comes_back_as_one_submodel_with_its_maps(tmp_path: Path) -
 
 def test_notes_are_told_and_stand_among_the_attempts(tmp_path: Path) -> None:
     heard = Heard()
-    with RunDirectory(tmp_path / "run") as run:
+    with quiet_run(tmp_path / "run", heard) as run:
         network = CountingNetwork(notes=("half the keyframes",))
-        result = FeedForwardBackbone(network, photographs(), run, heard).reconstruct([WINDOW], with_maps=())
+        result = FeedForwardBackbone(network, photographs(), run).reconstruct([WINDOW], with_maps=())
     assert heard.notes == ["segment 0: half the keyframes"]
     assert result.reconstructions[0].attempts == ("looked", "half the keyframes")
 
@@ -211,18 +211,18 @@ def test_descriptors_are_made_once_and_have_unit_length(tmp_path: Path) -> None:
     expected = np.array([[0.6, 0.8], [0, 0], [0, 0], [0, 0], [-1, 0], [0, 1]])
     network = CountingNetwork(descriptors=rows)
     for _ in range(2):
-        with RunDirectory(tmp_path / "run") as run:
-            made = FeedForwardBackbone(network, photographs(), run, Heard()).describe()
+        with quiet_run(tmp_path / "run") as run:
+            made = FeedForwardBackbone(network, photographs(), run).describe()
         np.testing.assert_allclose(made, expected, atol=1e-6)
         assert made.dtype == np.float32
     assert network.described == 1
     network.key = "other weights"
-    with RunDirectory(tmp_path / "run") as run:
-        FeedForwardBackbone(network, photographs(), run, Heard()).describe()
+    with quiet_run(tmp_path / "run") as run:
+        FeedForwardBackbone(network, photographs(), run).describe()
         assert network.described == 2
         network.key, network.descriptors = "too few", rows[:4]
         with pytest.raises(ValueError, match=r"descriptors are \(4, 2\), needed \(6, D\)"):
-            FeedForwardBackbone(network, photographs(), run, Heard()).describe()
+            FeedForwardBackbone(network, photographs(), run).describe()
 
 
 # ------------------------------------------------------------------------------ bad predictions
@@ -357,7 +357,7 @@ class Options:
 
 def make(context, options):
     predictor = RoomPredictor(context.collection, warnings=options.warnings)
-    return FeedForwardBackbone(predictor, context.collection, context.run, context.reporter)
+    return FeedForwardBackbone(predictor, context.collection, context.run)
 
 plugin = BackbonePlugin(make=make, options=Options)
 """

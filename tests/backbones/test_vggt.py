@@ -19,6 +19,7 @@ import pytest
 import safetensors.torch
 import torch
 from helpers.room_network import context_of, demo_room, pinhole, relative_pose
+from helpers.runs import run_in
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -246,7 +247,7 @@ def test_at_the_trained_size_a_photograph_is_518_wide(
 ) -> None:
     collection = photographs(tmp_path / "images", room, [CAMERAS["landscape"]] * 2)
     predictor = backbone_of(collection, run, checkpoint, {"size": "518"}).predictor
-    backbone = FeedForwardBackbone(predictor, collection, run, QuietReporter(sys.stderr))
+    backbone = FeedForwardBackbone(predictor, collection, run_in(run))
     maps = backbone.reconstruct([Segment(index=0, images=(0, 1))], with_maps=[0]).dense[0]
     assert room.inputs[0].shape == (1, 2, 3, 392, 518)
     assert maps.depth(1).shape == (392, 518)

@@ -17,6 +17,7 @@ from helpers.room_network import install_package
 from helpers.summaries import GOOD
 
 from smust3r_colmap import __version__
+from smust3r_colmap.alignment.stage import EdgeSummary
 from smust3r_colmap.backbones.registry import list_backbones
 from smust3r_colmap.cli import doctor
 from smust3r_colmap.cli import main as cli
@@ -33,7 +34,6 @@ from smust3r_colmap.execution.progress import (
 )
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.report.summary import (
-    EdgeSummary,
     ImageNote,
     RefinementSummary,
     RunSummary,

@@ -18,6 +18,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.cli.refine import Refine, run_refine
+from smust3r_colmap.dense.external_points import refined_from_start
 from smust3r_colmap.errors import ConfigError, InputError
 from smust3r_colmap.evaluation.readers import read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import Evaluation, compare_trajectories
@@ -27,7 +28,6 @@ from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import pointmap_from_depth
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
 from smust3r_colmap.products import EMPTY_CLOUD, Scene
-from smust3r_colmap.refine_model import refined_from_start
 from smust3r_colmap.report.summary import RunSummary
 from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
 from smust3r_colmap.validation.surroundings import read_ply

@@ -37,11 +37,11 @@ def test_cloud_lies_on_the_surface_with_its_colours_and_normals() -> None:
     cloud = fused.cloud
     radius = np.linalg.norm(cloud.xyz, axis=1)
     assert 1000 < len(cloud) < 10_000
-    assert fused.num_far == 0
+    assert fused.statistics.num_far == 0
     # Averaging over a cell of edge v pulls inward by less than v ** 2.
-    assert 1 - fused.voxel_size**2 < radius.min() < radius.max() < 1 + 1e-5
+    assert 1 - fused.statistics.voxel_size**2 < radius.min() < radius.max() < 1 + 1e-5
     difference = np.abs(paint(cloud.xyz).astype(float) - cloud.rgb)
-    assert difference.max() < 127.5 * fused.voxel_size
+    assert difference.max() < 127.5 * fused.statistics.voxel_size
     assert cloud.normals is not None
     np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1, atol=1e-6)
     cosines = np.einsum("ij,ij->i", cloud.normals, cloud.xyz / radius[:, None])
@@ -55,8 +55,8 @@ def test_max_points_is_a_strict_bound_and_is_used(max_points: int) -> None:
     fused = make_world().points(max_points=max_points)
     assert len(fused.cloud) <= max_points
     if max_points >= 100:
-        assert len(fused.cloud) + fused.num_seen_once >= 0.85 * max_points
-    assert fused.num_samples <= 4 * max_points + NUM_IMAGES
+        assert len(fused.cloud) + fused.statistics.num_seen_once >= 0.85 * max_points
+    assert fused.statistics.num_samples <= 4 * max_points + NUM_IMAGES
     assert np.isfinite(fused.cloud.xyz).all()
 
 
@@ -64,9 +64,9 @@ def test_cells_start_at_the_distance_of_pixels() -> None:
     """Not so small that every pixel stays a point of its own."""
     fused = make_world().points(max_points=10**6)
     footprint = 2.1 / (600 * 56 / 640)
-    assert 0.7 * footprint < fused.voxel_size < 1.5 * footprint
-    assert fused.num_samples == fused.num_pixels
-    assert len(fused.cloud) < 0.6 * fused.num_pixels
+    assert 0.7 * footprint < fused.statistics.voxel_size < 1.5 * footprint
+    assert fused.statistics.num_samples == fused.statistics.num_pixels
+    assert len(fused.cloud) < 0.6 * fused.statistics.num_pixels
 
 
 def test_result_is_the_same_every_time() -> None:
@@ -87,7 +87,7 @@ def test_every_image_gives_its_pixels_once_from_the_submodel_where_it_is_central
         for image in images
     )
     assert world.cameras().best_submodel.tolist() == [p for p, images in used.items() for _ in images]
-    assert world.points().num_pixels == expected
+    assert world.points().statistics.num_pixels == expected
 
 
 def test_cloud_moves_with_the_fused_cameras_not_with_the_submodels() -> None:
@@ -107,7 +107,7 @@ def test_cloud_moves_with_the_fused_cameras_not_with_the_submodels() -> None:
         min_confidence=2.0,
     )
     radius = np.linalg.norm(fused.cloud.xyz - shift, axis=1)
-    assert 1 - fused.voxel_size**2 < radius.min() < radius.max() < 1 + 1e-5
+    assert 1 - fused.statistics.voxel_size**2 < radius.min() < radius.max() < 1 + 1e-5
 
 
 def test_pixels_of_a_wrong_pose_follow_the_pose_that_was_kept() -> None:
@@ -119,7 +119,7 @@ def test_pixels_of_a_wrong_pose_follow_the_pose_that_was_kept() -> None:
     cameras = replace(world.cameras(), cam_from_world=invert_rigid(exact.world_from_cam))
     fused = fuse_points(world.placed(), world.dense, cameras, max_points=20_000, min_confidence=2.0)
     radius = np.linalg.norm(fused.cloud.xyz, axis=1)
-    assert 1 - fused.voxel_size**2 < radius.min() < radius.max() < 1 + 1e-5
+    assert 1 - fused.statistics.voxel_size**2 < radius.min() < radius.max() < 1 + 1e-5
 
 
 def edited(edit: Callable[[World], None]) -> World:
@@ -135,8 +135,11 @@ def test_pixels_below_the_confidence_are_left_out() -> None:
                 confidence[:, : confidence.shape[1] // 2] = 1.9
 
     halved = edited(doubt_the_left_half).points()
-    assert 0.4 < halved.num_pixels / make_world().points().num_pixels < 0.6
-    assert edited(doubt_the_left_half).points(min_confidence=1.5).num_pixels == make_world().points().num_pixels
+    assert 0.4 < halved.statistics.num_pixels / make_world().points().statistics.num_pixels < 0.6
+    assert (
+        edited(doubt_the_left_half).points(min_confidence=1.5).statistics.num_pixels
+        == make_world().points().statistics.num_pixels
+    )
 
 
 def test_pixels_behind_the_camera_or_without_a_point_are_left_out() -> None:
@@ -151,7 +154,7 @@ def test_pixels_behind_the_camera_or_without_a_point_are_left_out() -> None:
 
     spoiled = edited(spoil).points()
     lost = np.count_nonzero(make_world().dense[0].confidences[2] >= 2)
-    assert make_world().points().num_pixels - spoiled.num_pixels == lost
+    assert make_world().points().statistics.num_pixels - spoiled.statistics.num_pixels == lost
     assert np.linalg.norm(spoiled.cloud.xyz, axis=1).max() < 1 + 1e-5
 
 
@@ -169,7 +172,7 @@ def test_points_that_one_image_only_saw_are_dropped() -> None:
     world = edited(add_flying_pixels)
     fused = world.points()
     flying = np.linalg.norm(fused.cloud.xyz, axis=1) < 0.9
-    assert fused.num_seen_once > 500
+    assert fused.statistics.num_seen_once > 500
     assert flying.mean() < 0.03
     assert len(fused.cloud) > 2000
 
@@ -177,7 +180,7 @@ def test_points_that_one_image_only_saw_are_dropped() -> None:
 def test_points_that_one_image_only_saw_stay_where_little_else_is_there() -> None:
     world = make_world((range(0, 1),))
     fused = world.points()
-    assert fused.num_seen_once == 0
+    assert fused.statistics.num_seen_once == 0
     assert len(fused.cloud) > 300
 
 
@@ -218,7 +221,7 @@ def test_maps_of_one_column_are_fused() -> None:
     column = np.zeros((50, 1, 3))
     column[:, 0, 1] = np.linspace(0, 1, 50)
     fused = facing_cameras([column]).points()
-    assert (len(fused.cloud), fused.num_far) == (50, 0)
+    assert (len(fused.cloud), fused.statistics.num_far) == (50, 0)
 
 
 def test_pixels_at_infinity_do_not_coarsen_the_cloud() -> None:
@@ -228,16 +231,16 @@ def test_pixels_at_infinity_do_not_coarsen_the_cloud() -> None:
                 pointmap[20, 25] += 1e9 * (pointmap[20, 25] - centre)
 
     fused = edited(send_one_away).points()
-    assert fused.num_far == NUM_IMAGES
-    assert fused.voxel_size == pytest.approx(make_world().points().voxel_size, rel=0.05)
+    assert fused.statistics.num_far == NUM_IMAGES
+    assert fused.statistics.voxel_size == pytest.approx(make_world().points().statistics.voxel_size, rel=0.05)
     assert np.linalg.norm(fused.cloud.xyz, axis=1).max() < 1 + 1e-5
 
 
 def test_no_confident_pixel_gives_an_empty_cloud() -> None:
     fused = make_world().points(min_confidence=99)
     assert len(fused.cloud) == 0
-    assert (fused.num_pixels, fused.num_samples) == (0, 0)
-    assert np.isnan(fused.voxel_size)
+    assert (fused.statistics.num_pixels, fused.statistics.num_samples) == (0, 0)
+    assert np.isnan(fused.statistics.voxel_size)
 
 
 def test_far_from_the_origin_the_cloud_keeps_its_detail() -> None:
@@ -246,7 +249,7 @@ def test_far_from_the_origin_the_cloud_keeps_its_detail() -> None:
     world_from_seg = [shifted_by(one, away) for one in world.world_from_seg]
     fused = replace(world, world_from_seg=world_from_seg).points()
     radius = np.linalg.norm(fused.cloud.xyz - away, axis=1)
-    assert 1 - fused.voxel_size**2 < radius.min() < radius.max() < 1 + 1e-5
+    assert 1 - fused.statistics.voxel_size**2 < radius.min() < radius.max() < 1 + 1e-5
 
 
 def test_points_need_sensible_arguments() -> None:
@@ -293,7 +296,7 @@ def test_cloud_takes_pixels_of_a_loop_submodel_only_for_its_own_images() -> None
 
     def num_pixels(world: World, placed: Sequence[PlacedSubmodel]) -> int:
         cameras = fuse_cameras(placed)
-        return fuse_points(placed, world.dense, cameras, max_points=20_000, min_confidence=2.0).num_pixels
+        return fuse_points(placed, world.dense, cameras, max_points=20_000, min_confidence=2.0).statistics.num_pixels
 
     ends = sum(np.count_nonzero(world.dense[2].confidences[k] >= 2) for k in (0, 5))
     alone = make_world(windows)
@@ -308,7 +311,7 @@ def test_wider_groups_that_do_not_bend_give_the_same_scene(group: type[Transform
     np.testing.assert_allclose(wide.cameras().cam_from_world, world.cameras().cam_from_world, atol=1e-5)
     assert 0 <= wide.cameras().residual_px.max() < 0.01
     radius = np.linalg.norm(wide.points().cloud.xyz, axis=1)
-    assert 1 - wide.points().voxel_size ** 2 < radius.min() < radius.max() < 1 + 1e-4
+    assert 1 - wide.points().statistics.voxel_size ** 2 < radius.min() < radius.max() < 1 + 1e-4
 
 
 @pytest.mark.parametrize("group", [Affine3, SL4])

@@ -14,7 +14,7 @@ import pytest
 from helpers.finished_runs import NUM_PLACED, Example
 from helpers.tracked_scenes import angle_deg, centres_of, poses_of
 
-from smust3r_colmap.execution.task_pool import TaskFailure, map_tasks
+from smust3r_colmap.execution.task_pool import TaskFailure, TaskPool
 from smust3r_colmap.geometry.arrays import FloatArray
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/continue_in_colmap.md"
@@ -59,7 +59,8 @@ def continued(finished_example: Example, tmp_path_factory: pytest.TempPathFactor
     model.deregister_frame(TAKEN_OUT + 1)
     model.write(folder / "OUT/sparse/0")
     snippets = read_snippets(folder)
-    results = map_tasks(run_snippet, snippets, workers=1, log_file=folder / "native.log")
+    with TaskPool(workers=1, log_file=folder / "native.log") as pool:
+        results = list(pool.map(run_snippet, snippets))
     failed = [f"{snippets[r.index].heading}: {r.value.reason}" for r in results if isinstance(r.value, TaskFailure)]
     assert not failed, (failed, (folder / "native.log").read_text(errors="replace")[-3000:])
     return folder / "CONTINUED"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from smust3r_colmap.errors import StorageError
-from smust3r_colmap.execution.task_pool import TaskFailure, TaskPool, living_children_cpu_s, map_tasks
+from smust3r_colmap.execution.task_pool import TaskFailure, TaskPool, in_child, living_children_cpu_s
 
 
 def square_unless_told_otherwise(task: int | str) -> int:
@@ -29,7 +29,8 @@ def write_to_stderr_natively(text: str) -> None:
 
 
 def outcomes(tasks: list[int | str]) -> dict[int, int | TaskFailure]:
-    return {result.index: result.value for result in map_tasks(square_unless_told_otherwise, tasks, workers=2)}
+    with TaskPool(workers=2) as pool:
+        return {result.index: result.value for result in pool.map(square_unless_told_otherwise, tasks)}
 
 
 def test_every_task_gives_its_own_result() -> None:
@@ -108,7 +109,7 @@ def test_an_error_inside_the_block_ends_the_children_at_once() -> None:
 
 def test_native_messages_go_to_the_log(tmp_path: Path) -> None:
     log = tmp_path / "native.log"
-    list(map_tasks(write_to_stderr_natively, ["from the depths"], workers=1, log_file=log))
+    in_child(write_to_stderr_natively, "from the depths", log_file=log)
     assert "from the depths" in log.read_text()
 
 

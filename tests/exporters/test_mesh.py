@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from smust3r_colmap.errors import InputError, MissingDependencyError, ReconstructionError
-from smust3r_colmap.execution.task_pool import TaskFailure, TaskResult
+from smust3r_colmap.execution.task_pool import TaskFailure
 from smust3r_colmap.exporters import mesh as mesh_module
 from smust3r_colmap.exporters.dense_workspace import write_map
 from smust3r_colmap.exporters.mesh import MeshMethod, write_mesh
@@ -74,14 +74,13 @@ def cloud_of(points: FloatArray) -> PointCloud:
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Starting a child and loading Open3D there takes seconds; what it does there can be seen here."""
 
-    def run(function: Callable[[Any], Any], tasks: Sequence[Any], **options: object) -> Iterator[TaskResult[Any]]:
-        for index, task in enumerate(tasks):
-            try:
-                yield TaskResult(index=index, value=function(task))
-            except ReconstructionError as error:
-                yield TaskResult(index=index, value=TaskFailure(reason=str(error), crashed=False))
+    def run(function: Callable[[Any], Any], task: Any, **options: object) -> Any:
+        try:
+            return function(task)
+        except ReconstructionError as error:
+            return TaskFailure(reason=str(error), crashed=False)
 
-    monkeypatch.setattr(mesh_module, "map_tasks", run)
+    monkeypatch.setattr(mesh_module, "in_child", run)
 
 
 @pytest.fixture

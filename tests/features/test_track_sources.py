@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
+from helpers.runs import quiet_run
 from helpers.tracked_scenes import disturbed, stitched_scene
 from PIL import Image
 
-from smust3r_colmap.config import ImportConfig, RefinementConfig, RunConfig, TrackSource
+from smust3r_colmap.config import ClassicalConfig, ImportConfig, RefinementConfig, TrackSource
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
-from smust3r_colmap.execution.progress import QuietReporter
-from smust3r_colmap.execution.stage_clock import StageClock
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.importers.image_folder import collection_from_scan, scan_image_folder
-from smust3r_colmap.refinement.stage import Refinement, refine
+from smust3r_colmap.refinement.stage import InitialScenes, Refinement, refine
 from smust3r_colmap.storage.depth_maps import DepthMapWriter, StoredDepthMaps
-from smust3r_colmap.storage.run_directory import RunDirectory
 from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
 
 NUM_IMAGES, WITHOUT_POSE = 7, 6
@@ -60,25 +57,21 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Room:
 
 def refined(room: Room, output: Path, source: TrackSource) -> Refinement:
     posed = range(WITHOUT_POSE)
-    with RunDirectory(output) as run:
+    with quiet_run(output) as run:
         collection = collection_from_scan(scan_image_folder(room.images), ImportConfig())
         scene = stitched_scene(collection, room.stitched, posed, {0: CAMERA})
-        with run.stage("stitched", key="a test").write() as folder:
+        with run.folder.stage("stitched", key="a test").write() as folder:
             maps = DepthMapWriter(folder)
             for k in posed:
                 depth = (SCALE_ERROR * room.depth[k][::2, ::2]).astype(np.float32)
                 maps.write(f"{k}.png", depth, np.full(depth.shape, CONFIDENCE, np.float32))
             maps.finish()
-        return refine(
-            (scene,),
-            collection,
-            StoredDepthMaps(run.work / "stitched"),
-            None,
-            RunConfig(workers=1, refinement=RefinementConfig(tracks=source)),
-            run,
-            StageClock(QuietReporter(sys.stderr)),
-            parts=[tuple(posed)],
+        initial = InitialScenes(
+            scenes=(scene,), subsets=(tuple(posed),), maps=StoredDepthMaps(run.folder.work / "stitched")
         )
+        found = refine(run, initial, collection, None, RefinementConfig(tracks=source), ClassicalConfig())
+    assert found is not None
+    return found
 
 
 @pytest.mark.parametrize("source", ["features", "pointmaps", "both"])

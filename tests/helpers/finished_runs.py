@@ -31,12 +31,12 @@ from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.importers.image_folder import collection_from_scan, scan_image_folder
-from smust3r_colmap.products import ImageCollection, PointCloud
+from smust3r_colmap.products import FusedScene, ImageCollection, PointCloud
 from smust3r_colmap.refinement.global_refinement import RefinedFigures, RefineTask, refine_scenes
 from smust3r_colmap.storage.depth_maps import DepthMapWriter, StoredDepthMaps
 from smust3r_colmap.storage.finished_run import FinishedRun, write_finished
 from smust3r_colmap.storage.run_directory import DATABASE_FILE, MODEL_FOLDER, RunDirectory, key_of, write_json
-from smust3r_colmap.storage.scenes import read_scenes, write_scenes
+from smust3r_colmap.storage.scenes import FUSED_SCENES
 
 CAMERA = Intrinsics(model="SIMPLE_RADIAL", width=320, height=240, params=(290.0, 160.0, 120.0, -0.03))
 NAMES = tuple(f"große Halle/view {k:02d}.png" for k in range(11))
@@ -127,7 +127,7 @@ def _store(run: RunDirectory, collection: ImageCollection, world: World, images:
     scene = stitched_scene(collection, np.array(poses), range(len(poses)), {0: Intrinsics.from_colmap(model.camera(1))})
     cloud = PointCloud(xyz=np.array([p.xyz for p in points]), rgb=np.array([p.color for p in points]))
     with run.stage("scene", key="scene").write() as stage:
-        write_scenes(stage, (replace(scene, points=cloud),))
+        FUSED_SCENES.write(stage, (FusedScene(scene=replace(scene, points=cloud), statistics=None),))
     with run.stage("stitched", key="stitched").write() as stage:
         maps = DepthMapWriter(stage)
         for k in range(NUM_PLACED):
@@ -139,7 +139,7 @@ def _store(run: RunDirectory, collection: ImageCollection, world: World, images:
         output=run.root,
         native_log=run.native_log,
         images=images,
-        scenes=read_scenes(run.work / "scene"),
+        scenes=tuple(one.scene for one in FUSED_SCENES.read(run.work / "scene")),
         models=(refined / "0" / MODEL_FOLDER,),
         database=refined / DATABASE_FILE,
         maps=StoredDepthMaps(run.work / "stitched"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -11,10 +10,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from helpers.runs import run_in
 from smust3r_colmap.backbones.base import BackboneContext
 from smust3r_colmap.backbones.feed_forward import PredictedImage, SegmentPrediction
 from smust3r_colmap.config import RunConfig
-from smust3r_colmap.execution.progress import QuietReporter, Stage
+from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.geometry.arrays import Float32Array, FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.images import load_rgb
@@ -105,9 +105,7 @@ def context_of(
     return BackboneContext(
         collection=collection,
         config=RunConfig(backbone=backbone, backbone_options=options),
-        run=run,
-        reporter=QuietReporter(sys.stderr),
-        workers=1,
+        run=run_in(run),
     )
 
 

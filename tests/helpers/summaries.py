@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from smust3r_colmap.alignment.stage import EdgeSummary
+from smust3r_colmap.backbones.stage import SegmentSummary
 from smust3r_colmap.execution.stage_clock import StageSummary
-from smust3r_colmap.report.summary import EdgeSummary, GraphSummary, ModelSummary, RunSummary, SegmentSummary
+from smust3r_colmap.report.summary import ModelSummary, RunSummary
+from smust3r_colmap.stitching.stage import GraphSummary
 
 GOOD = RunSummary(
     output=Path("out"),
     num_images=5,
     num_registered=5,
-    models=(ModelSummary(folder="sparse/0", num_images=5, num_points=100, metric=False, segments=("0", "1")),),
+    models=(
+        ModelSummary(
+            folder="sparse/0", num_images=5, num_points=100, metric=False, segments=("0", "1"), cameras=None, cloud=None
+        ),
+    ),
     rejected=(),
     unregistered=(),
     stages=(

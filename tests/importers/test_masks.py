@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
+from helpers.runs import quiet_run
 from PIL import ExifTags, Image
 
 from smust3r_colmap.backbones import masked_maps
@@ -25,17 +26,19 @@ from smust3r_colmap.errors import ConfigError, ImageError, InputError, RunDirect
 from smust3r_colmap.evaluation.readers import read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.execution.progress import QuietReporter
+from smust3r_colmap.execution.task_pool import TaskPool
 from smust3r_colmap.features import stage as run_features
 from smust3r_colmap.features.sift import extract_features
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.image_folder import import_image_folder
 from smust3r_colmap.importers.masks import load_mask, names_without_mask, with_masks
+from smust3r_colmap.importers.stage import CameraChoice
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.products import ImageCollection, ImageMask, SourceImage
-from smust3r_colmap.refine_model import CameraChoice, refine_model
+from smust3r_colmap.refine_model import refine_model
 from smust3r_colmap.storage.depth_maps import StoredDepthMaps
-from smust3r_colmap.storage.run_directory import RunDirectory, key_of
+from smust3r_colmap.storage.run_directory import key_of
 from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
 
 WIDTH, HEIGHT, NUM_IMAGES = 320, 240, 8
@@ -184,10 +187,8 @@ def test_a_run_with_masks_among_the_images_ends_before_it_begins(drive: Drive, t
 def keypoints_of(collection: ImageCollection, path: Path) -> list[FloatArray]:
     """(K, 2) of every image; at half the size, so that positions must be carried to the size of the mask."""
     create_database(path, collection)
-    with QuietReporter(sys.stderr).stage("features", total=len(collection)) as stage:
-        extract_features(
-            path, collection, max_image_size=WIDTH // 2, max_features=100, workers=1, log_file=None, stage=stage
-        )
+    with TaskPool(workers=1) as pool, QuietReporter(sys.stderr).stage("features", total=len(collection)) as stage:
+        extract_features(path, collection, max_image_size=WIDTH // 2, max_features=100, executor=pool, stage=stage)
     with pycolmap.Database.open(path) as database:
         keypoints = [np.asarray(database.read_keypoints(i + 1)) for i in range(len(collection))]
     return [each[:, :2].astype(np.float64) for each in keypoints]
@@ -216,12 +217,12 @@ def test_the_key_of_the_features_knows_the_content_of_masks_and_stays_without(
 
     def key(collection: ImageCollection) -> str:
         first = replace(collection, images=collection.images[:1])
-        return run_features.features_of_run(first, config, run, QuietReporter(sys.stderr), workers=1, seed=3).key
+        return run_features.features_of_run(run, first, config).key
 
     write_mask(tmp_path / "masks/000.png")
     plain = collection_of(drive)
-    as_ever = key_of("features", [(plain.images[0].digest, WIDTH, HEIGHT, 0)], plain.cameras, 100, 10, 3)
-    with RunDirectory(tmp_path / "run") as run:
+    as_ever = key_of("features", [(plain.images[0].digest, WIDTH, HEIGHT, 0)], plain.cameras, 100, 10, 0)
+    with quiet_run(tmp_path / "run") as run:
         assert key(plain) == as_ever
         keys = {as_ever, key(collection_of(drive, drive.masks)), key(collection_of(drive, tmp_path / "masks"))}
     assert len(keys) == 3

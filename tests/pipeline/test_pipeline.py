@@ -437,6 +437,7 @@ def test_a_walk_that_comes_back_is_closed_and_a_run_without_loops_is_not(
     assert closed, [loop.reason for loop in summary.loops]
     assert all(loop.segment_b - loop.segment_a >= 3 for loop in closed)
     assert all(0 <= loop.gap_after_percent < max(loop.gap_before_percent, 0.5) for loop in closed)
+    assert summary.graph is not None
     assert summary.graph.num_loops == len(closed)
     assert summary.graph.cost_after <= summary.graph.cost_before
     assert {segment.kind for segment in summary.segments} == {"window", "loop"}
@@ -455,6 +456,7 @@ def test_a_walk_that_comes_back_is_closed_and_a_run_without_loops_is_not(
     without = replace(ROUND, loop_closing=LoopConfig(loops=False), refinement=UNREFINED.refinement)
     plain = run(round_trip / "images", tmp_path / "out", without)
     assert plain.loops == ()
+    assert plain.graph is not None
     assert plain.graph.num_loops == 0
     assert not (tmp_path / "out/trajectory_without_loops_tum.txt").exists()
     assert all(was_reused for name, was_reused in reused(plain).items() if name in {"features", "mapping", "depth"})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import sqlite3
 import threading
 from collections.abc import Callable, Iterable, Sequence
@@ -16,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
+from helpers.runs import quiet_run
 from helpers.tracked_scenes import (
     CAMERA,
     COLOUR,
@@ -40,12 +40,11 @@ from helpers.tracked_scenes import (
     wrong_matches,
 )
 
-from smust3r_colmap.config import RefinementConfig, RunConfig
+from smust3r_colmap.config import ClassicalConfig, RefinementConfig, RunConfig
 from smust3r_colmap.errors import ConfigError
-from smust3r_colmap.execution.progress import QuietReporter, Stage
-from smust3r_colmap.execution.stage_clock import StageClock
-from smust3r_colmap.execution.task_pool import TaskResult
-from smust3r_colmap.features.seen_surfaces import surfaces_of_clouds
+from smust3r_colmap.execution.progress import Stage
+from smust3r_colmap.features import stage as features_stage
+from smust3r_colmap.features.seen_surfaces import GRID, surfaces_of_clouds
 from smust3r_colmap.geometry.arrays import FloatArray, Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import ImageCollection, PointCloud, RunFeatures, Scene
@@ -55,8 +54,8 @@ from smust3r_colmap.refinement import stage as refine
 from smust3r_colmap.refinement.bundle_adjustment import ENOUGH_OBSERVATIONS, MANY_OBSERVATIONS, figures_of
 from smust3r_colmap.refinement.global_refinement import RefinedFigures, RefineTask, refine_scenes
 from smust3r_colmap.refinement.mapper import Bench
-from smust3r_colmap.refinement.stage import Refinement
-from smust3r_colmap.storage.run_directory import RunDirectory, StageFolder, read_json
+from smust3r_colmap.refinement.stage import InitialScenes, Refinement
+from smust3r_colmap.storage.run_directory import StageFolder, read_json
 
 pytestmark = pytest.mark.usefixtures("quiet_pycolmap")
 
@@ -653,21 +652,16 @@ class Start:
     features: RunFeatures
     output: Path
 
-    def refine(self, config: RunConfig | None = None, *, with_surfaces: bool = False) -> Refinement:
+    def refine(self, options: RefinementConfig | None = None, *, with_surfaces: bool = False) -> Refinement:
         """As the pipeline does it; without surfaces no new pairs are looked for."""
         seen = [self.world.points[rows[rows >= 0]] for rows in self.world.point_of]
-        with RunDirectory(self.output) as run:
-            return refine.refine(
-                self.scenes,
-                self.collection,
-                None,
-                self.features,
-                config or RunConfig(workers=1),
-                run,
-                StageClock(QuietReporter(io.StringIO())),
-                parts=(),
-                surfaces=dict(enumerate(seen)) if with_surfaces else {},
+        initial = InitialScenes(scenes=self.scenes, subsets=(), surfaces=dict(enumerate(seen)) if with_surfaces else {})
+        with quiet_run(self.output) as run:
+            found = refine.refine(
+                run, initial, self.collection, self.features, options or RefinementConfig(), ClassicalConfig()
             )
+        assert found is not None
+        return found
 
 
 @pytest.fixture
@@ -682,8 +676,8 @@ def start(tmp_path: Path) -> Start:
     return Start(world=world, collection=collection, scenes=(scene,), features=features, output=tmp_path / "out")
 
 
-def in_this_process(function: Callable[[Any], Any], tasks: Sequence[Any], **_: Any) -> list[TaskResult[Any]]:
-    return [TaskResult(index=index, value=function(one)) for index, one in enumerate(tasks)]
+def in_this_process(function: Callable[[Any], Any], task: Any, **_: Any) -> Any:
+    return function(task)
 
 
 def test_child_does_the_work_and_a_second_start_reads_what_it_stored(
@@ -703,7 +697,7 @@ def test_child_does_the_work_and_a_second_start_reads_what_it_stored(
     def refuse(*_: Any, **__: Any) -> None:
         raise AssertionError("nothing is left to do")
 
-    monkeypatch.setattr(refine, "map_tasks", refuse)
+    monkeypatch.setattr(refine, "in_child", refuse)
     second = start.refine()
     assert second.figures == first.figures
     np.testing.assert_array_equal(second.scenes[0].cam_from_world, scene.cam_from_world)
@@ -713,15 +707,15 @@ def test_child_does_the_work_and_a_second_start_reads_what_it_stored(
 def test_other_settings_or_poses_are_another_refinement(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     runs = []
 
-    def count(function: Callable[[Any], Any], tasks: Sequence[Any], **rest: Any) -> list[TaskResult[Any]]:
-        runs.append(tasks)
-        return in_this_process(function, tasks, **rest)
+    def count(function: Callable[[Any], Any], task: Any, **rest: Any) -> Any:
+        runs.append(task)
+        return in_this_process(function, task, **rest)
 
-    monkeypatch.setattr(refine, "map_tasks", count)
+    monkeypatch.setattr(refine, "in_child", count)
     start.refine()
     start.refine()
     assert len(runs) == 1
-    start.refine(RunConfig(workers=1, refinement=RefinementConfig(track_neighbours=3)))
+    start.refine(RefinementConfig(track_neighbours=3))
     assert len(runs) == 2
     moved = replace(start.scenes[0], cam_from_world=start.world.cam_from_world)
     replace(start, scenes=(moved,)).refine()
@@ -742,11 +736,11 @@ def test_second_start_wants_the_same_pairs_although_they_are_matched_now(
                     opened.write_matches(i + 1, j + 1, true_matches(start.world, (i, j)))
         return frozenset(wanted[-1])
 
-    monkeypatch.setattr(refine, "match_pairs", match)
-    monkeypatch.setattr(refine, "map_tasks", in_this_process)
-    config = RunConfig(workers=1, refinement=RefinementConfig(track_neighbours=1))
-    first = start.refine(config, with_surfaces=True)
-    second = start.refine(config, with_surfaces=True)
+    monkeypatch.setattr(features_stage, "match_pairs", match)
+    monkeypatch.setattr(refine, "in_child", in_this_process)
+    options = RefinementConfig(track_neighbours=1)
+    first = start.refine(options, with_surfaces=True)
+    second = start.refine(options, with_surfaces=True)
     assert wanted[0] == wanted[1] != []
     assert not set(wanted[0]) & set(pairs_within(range(len(start.world)), 3))
     assert first.figures == second.figures
@@ -815,5 +809,5 @@ def test_surface_of_an_image_is_the_nearest_of_the_cloud_in_every_cell() -> None
     assert set(surfaces) == set(range(len(world)))
     for i, points in surfaces.items():
         towards = world.centres[i] / np.linalg.norm(world.centres[i])
-        assert 15 < len(points) <= refine.GRID**2
+        assert 15 < len(points) <= GRID**2
         assert (points @ towards > 0).mean() > 0.9, "the far side of the ball is hidden"

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
+from helpers.runs import quiet_run
 from helpers.tracked_scenes import (
     CAMERA,
     World,
@@ -34,10 +33,8 @@ from helpers.tracked_scenes import (
     write_features,
 )
 
-from smust3r_colmap.config import RefinementConfig, RunConfig
-from smust3r_colmap.execution.progress import QuietReporter
-from smust3r_colmap.execution.stage_clock import StageClock
-from smust3r_colmap.execution.task_pool import TaskFailure, TaskResult
+from smust3r_colmap.config import ClassicalConfig, RefinementConfig
+from smust3r_colmap.execution.task_pool import TaskFailure
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import RunFeatures
@@ -54,7 +51,8 @@ from smust3r_colmap.refinement.principal_point import (
     PrincipalPointAnswer,
     ask_for_principal_points,
 )
-from smust3r_colmap.storage.run_directory import RunDirectory, StageFolder
+from smust3r_colmap.refinement.stage import InitialScenes
+from smust3r_colmap.storage.run_directory import StageFolder
 
 pytestmark = pytest.mark.usefixtures("quiet_pycolmap")
 
@@ -394,18 +392,18 @@ def test_setting_of_the_run_reaches_the_task(
 ) -> None:
     handed: list[RefineTask] = []
 
-    def keep(_: Any, tasks: Sequence[RefineTask], **__: Any) -> list[TaskResult[Any]]:
-        handed.extend(tasks)
-        return [TaskResult(index=0, value=TaskFailure(reason="a test", crashed=False))]
+    def keep(_: Any, task: RefineTask, **__: Any) -> TaskFailure:
+        handed.append(task)
+        return TaskFailure(reason="a test", crashed=False)
 
-    monkeypatch.setattr(refine, "map_tasks", keep)
+    monkeypatch.setattr(refine, "in_child", keep)
     one = refine_task(tmp_path, seen)
     features = RunFeatures(
         database=tmp_path / "features.db", key="a test", usable=(True,) * len(one.collection), rejected=()
     )
-    config = RunConfig(workers=1, refinement=RefinementConfig(principal_point=wanted))
-    clock = StageClock(QuietReporter(io.StringIO()))
-    with RunDirectory(tmp_path / "out") as run:
-        refine.refine(one.scenes, one.collection, None, features, config, run, clock, parts=(), surfaces={})
+    initial = InitialScenes(scenes=one.scenes, subsets=(), surfaces={})
+    with quiet_run(tmp_path / "out") as run:
+        options = RefinementConfig(principal_point=wanted)
+        refine.refine(run, initial, one.collection, features, options, ClassicalConfig())
     assert [each.principal_point for each in handed] == [wanted]
     assert RefinementConfig().principal_point, "the middle is left by default"

@@ -11,7 +11,7 @@ from helpers.finished_runs import NUM_PLACED, Example, refine_corner
 from helpers.tracked_scenes import angle_deg, centres_of, poses_of
 
 from smust3r_colmap.config import ImportConfig
-from smust3r_colmap.execution.task_pool import TaskFailure, TaskResult
+from smust3r_colmap.execution.task_pool import TaskFailure
 from smust3r_colmap.importers.image_folder import collection_from_scan, scan_image_folder
 from smust3r_colmap.refinement import registration as completion_module
 from smust3r_colmap.refinement.acceptance import StepReport
@@ -113,8 +113,8 @@ def test_a_mapper_that_moves_what_stood_is_undone(
 def test_a_mapper_that_dies_adds_nothing(
     finished_example: Example, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    death = TaskResult[None](index=0, value=TaskFailure(reason="the process died", crashed=True))
-    monkeypatch.setattr(completion_module, "map_tasks", lambda *_, **__: iter([death]))
+    death = TaskFailure(reason="the process died", crashed=True)
+    monkeypatch.setattr(completion_module, "in_child", lambda *_, **__: death)
     before = without(finished_example, TAKEN_OUT)
     done = complete(before, finished_example, tmp_path)
     assert done.model is before

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.runs import quiet_run
 from helpers.scenes import CAMERA, rotation_about_y, some_sim3
 
-from smust3r_colmap import pipeline
 from smust3r_colmap.backbones.base import BackboneResult
 from smust3r_colmap.errors import DegenerateAlignmentError
-from smust3r_colmap.execution.progress import QuietReporter
-from smust3r_colmap.execution.stage_clock import StageClock
 from smust3r_colmap.geometry.affine3 import Affine3
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.products import (
@@ -25,7 +22,8 @@ from smust3r_colmap.products import (
     TransformEstimate,
 )
 from smust3r_colmap.segmentation.loop_segments import PlannedLoop
-from smust3r_colmap.stitching import stitch_submodels as stitching
+from smust3r_colmap.segmentation.stage import NOT_LOOKED_FOR, Segments
+from smust3r_colmap.stitching import stitch as stitching
 from smust3r_colmap.stitching.loop_verification import LoopDecision, UncertainTransform, covariance_of
 from smust3r_colmap.stitching.pose_graph.graph import PoseGraph
 from smust3r_colmap.stitching.pose_graph.optimise import GraphSolution, optimise
@@ -335,10 +333,11 @@ def test_a_chain_that_cannot_be_drawn_costs_the_comparison_and_not_the_run(monke
     maps = tuple(EmptyMaps(submodel, longer_side=8) for submodel in ring.submodels)
     result = BackboneResult(reconstructions=reconstructions, dense=maps, dense_key="", matches=None, rejected=())
 
-    def beyond_infinity(*_: object) -> None:
+    def beyond_infinity(*_: object, **__: object) -> None:
         raise DegenerateAlignmentError("2 of 16 cameras lie beyond the plane that the transform sends to infinity")
 
-    monkeypatch.setattr(pipeline, "_placed_submodels", beyond_infinity)
-    clock = StageClock(QuietReporter(sys.stderr))
+    monkeypatch.setattr(stitching_stage, "place_submodel", beyond_infinity)
     collection = ImageCollection(images=(), cameras=())
-    assert pipeline._without_loops(result, (), found, collection, clock) is None
+    segments = Segments(windows=(), loops=NOT_LOOKED_FOR)
+    with quiet_run(tmp_path / "out") as run:
+        assert stitching_stage._without_loops(run, result, segments, found.chained, collection) is None

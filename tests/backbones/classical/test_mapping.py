@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from helpers.runs import quiet_run
 from helpers.scenes import CAMERA, make_submodel, points_ahead, rotation_about_y, walk
 
 from smust3r_colmap.backbones.classical import backbone as backbone_module
@@ -45,7 +46,8 @@ from smust3r_colmap.config import ClassicalConfig
 from smust3r_colmap.errors import StorageError
 from smust3r_colmap.estimators.weighted_median import weighted_median
 from smust3r_colmap.execution.progress import QuietReporter
-from smust3r_colmap.execution.task_pool import TaskFailure, TaskPool, TaskResult, map_tasks
+from smust3r_colmap.execution.run_context import Run
+from smust3r_colmap.execution.task_pool import TaskFailure, TaskPool, TaskResult
 from smust3r_colmap.features import sift as features_module
 from smust3r_colmap.features.matching import match_pairs
 from smust3r_colmap.features.pairs import plan_loop_pairs, plan_pairs
@@ -54,7 +56,6 @@ from smust3r_colmap.features.vlad import vlad_descriptors
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.products import ImageCollection, RunFeatures, Segment, SourceImage, Tracks
-from smust3r_colmap.storage.run_directory import RunDirectory
 
 NUM_IMAGES = 8
 
@@ -531,7 +532,8 @@ def open_many_times(path: Path) -> int:
 def test_processes_that_open_the_database_at_the_same_moment_wait_for_each_other(
     synthetic: tuple[MappingTask, pycolmap.Reconstruction],
 ) -> None:
-    results = map_tasks(open_many_times, [synthetic[0].database] * 2, workers=2)
+    with TaskPool(workers=2) as pool:
+        results = list(pool.map(open_many_times, [synthetic[0].database] * 2))
     assert [result.value for result in results] == [NUM_IMAGES, NUM_IMAGES]
 
 
@@ -546,7 +548,7 @@ def test_pairs_that_could_not_be_matched_are_not_reported_as_done(
     synthetic: tuple[MappingTask, pycolmap.Reconstruction], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = synthetic[0].database
-    monkeypatch.setattr(features_module, "map_tasks", one_failure)
+    monkeypatch.setattr(TaskPool, "map", one_failure)
     with QuietReporter(sys.stderr).stage("matching", total=2) as stage:
         done = match_pairs(path, [(0, 1), (0, 77)], workers=1, seed=0, log_file=None, stage=stage)
     assert done == {(0, 1)}
@@ -561,14 +563,10 @@ def test_a_segment_that_failed_is_tried_again_at_the_next_start(
 ) -> None:
     kept = read_only_segment(0, model_of_walk(6))
     monkeypatch.setattr(TaskPool, "map", one_failure)
-    with (
-        RunDirectory(tmp_path / "out") as run,
-        QuietReporter(sys.stderr).stage("mapping", total=1) as stage,
-        TaskPool(workers=1) as pool,
-    ):
+    with quiet_run(tmp_path / "out") as run, run.clock.stage("mapping", total=1) as stage:
         backbone = backbone_of(synthetic[0], run)
-        folder = run.stage("segments", "0000", "calibrated", key="k")
-        (found,) = backbone._finish(map_segment, [synthetic[0]], [folder], [kept], stage, pool)
+        folder = run.folder.stage("segments", "0000", "calibrated", key="k")
+        (found,) = backbone._finish(map_segment, [synthetic[0]], [folder], [kept], stage)
         assert not folder.is_done
     assert found.models == kept.models
     assert found.attempts == ("calibrated: out of memory",)
@@ -585,18 +583,18 @@ def test_a_global_mapper_that_kills_its_process_costs_only_its_own_rung(
 ) -> None:
     monkeypatch.setattr(backbone_module, "map_segment", die_in_the_global_mapper)
     task = synthetic[0]
-    with RunDirectory(tmp_path / "out") as run, TaskPool(workers=1) as pool:
-        (mapped,) = backbone_of(task, run)._map([Segment(index=0, images=task.images)], {0: task.pairs}, pool)
+    with quiet_run(tmp_path / "out") as run:
+        (mapped,) = backbone_of(task, run)._map([Segment(index=0, images=task.images)], {0: task.pairs})
     assert mapped.models[0].images == tuple(range(6))
 
 
-def backbone_of(task: MappingTask, run: RunDirectory) -> ClassicalBackbone:
+def backbone_of(task: MappingTask, run: Run) -> ClassicalBackbone:
     """A backbone whose features are in the database of a task."""
-    image = SourceImage(name="0", path=run.root / "0", width=640, height=480, camera=0, digest="0")
+    image = SourceImage(name="0", path=run.folder.root / "0", width=640, height=480, camera=0, digest="0")
     collection = ImageCollection(
         images=tuple(replace(image, name=str(k)) for k in range(NUM_IMAGES)), cameras=(CAMERA,)
     )
-    backbone = ClassicalBackbone(collection, ClassicalConfig(), run, QuietReporter(sys.stderr), workers=1, seed=0)
+    backbone = ClassicalBackbone(collection, ClassicalConfig(), run)
     backbone._features = RunFeatures(database=task.database, key="features", usable=(True,) * NUM_IMAGES, rejected=())
     return backbone
 
@@ -606,9 +604,9 @@ def test_a_sweep_that_failed_leaves_readable_empty_maps_and_is_tried_again(
 ) -> None:
     monkeypatch.setattr(TaskPool, "map", one_failure)
     submodel = make_submodel(walk(3), (0, 1, 2), points_ahead(9, np.random.default_rng(0)), Sim3.identity())
-    with RunDirectory(tmp_path / "out") as run, TaskPool(workers=1) as pool:
+    with quiet_run(tmp_path / "out") as run:
         backbone = backbone_of(synthetic[0], run)
-        (maps,), _ = backbone._dense([submodel], [submodel.segment], pool)
+        (maps,), _ = backbone._dense([submodel], [submodel.segment])
         assert not backbone._depth_task(submodel).folder.is_done
     assert len(maps) == 3
     assert maps.depth(2).shape == (288, 384)

@@ -16,6 +16,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from helpers.runs import run_in
 
 from smust3r_colmap.backbones.base import BackboneContext
 from smust3r_colmap.backbones.must3r import backbone as backbone_module
@@ -107,9 +108,7 @@ def predictor(room: Path, weights: Path, tmp_path: Path) -> Iterator[Callable[..
         context = BackboneContext(
             collection=import_image_folder(room, importing),
             config=config,
-            run=run,
-            reporter=QuietReporter(sys.stderr),
-            workers=1,
+            run=run_in(run),
         )
         made = make_must3r(context, NoOptions()).predictor
         assert isinstance(made, Must3rPredictor)
