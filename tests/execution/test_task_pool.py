@@ -114,8 +114,9 @@ def test_native_messages_go_to_the_log(tmp_path: Path) -> None:
 
 
 def test_stopping_early_ends_the_children() -> None:
-    results = map_tasks(time.sleep, [0.0, 60.0, 60.0], workers=2)
     started = time.monotonic()
-    next(results)
-    results.close()  # type: ignore[attr-defined]
+    with TaskPool(workers=2) as pool:
+        results = pool.map(time.sleep, [0.0, 60.0, 60.0])
+        next(results)
+        results.close()  # type: ignore[attr-defined]
     assert time.monotonic() - started < 30

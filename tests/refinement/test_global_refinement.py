@@ -40,7 +40,7 @@ from helpers.tracked_scenes import (
     wrong_matches,
 )
 
-from smust3r_colmap.config import ClassicalConfig, RefinementConfig, RunConfig
+from smust3r_colmap.config import ClassicalConfig, RefinementConfig
 from smust3r_colmap.errors import ConfigError
 from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.features import stage as features_stage
@@ -784,8 +784,8 @@ def test_database_that_breaks_leaves_the_stitched_scenes_with_a_reason(start: St
 
 
 def test_tracks_of_pointmaps_need_maps(start: Start) -> None:
-    with pytest.raises(ConfigError, match="--tracks pointmaps: the model has no depth maps; take features"):
-        start.refine(RunConfig(workers=1, refinement=RefinementConfig(tracks="pointmaps")))
+    with pytest.raises(ConfigError, match="--track-source pointmaps: the model has no depth maps; take features"):
+        start.refine(RefinementConfig(tracks="pointmaps"))
 
 
 # -------------------------------------------------------------------------- surfaces

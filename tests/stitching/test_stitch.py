@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from smust3r_colmap.products import (
 )
 from smust3r_colmap.segmentation.loop_segments import PlannedLoop
 from smust3r_colmap.segmentation.stage import NOT_LOOKED_FOR, Segments
+from smust3r_colmap.stitching import stage as stitching_stage
 from smust3r_colmap.stitching import stitch as stitching
 from smust3r_colmap.stitching.loop_verification import LoopDecision, UncertainTransform, covariance_of
 from smust3r_colmap.stitching.pose_graph.graph import PoseGraph
@@ -319,7 +321,9 @@ def test_the_gap_of_a_camera_that_only_turns_has_no_distance() -> None:
     assert np.isnan(closure_gap(decision, submodels, edges, [part]).distance)
 
 
-def test_a_chain_that_cannot_be_drawn_costs_the_comparison_and_not_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_chain_that_cannot_be_drawn_costs_the_comparison_and_not_the_run(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     ring = Ring(0)
     ring.add_loop(0, 10)
     found = ring.stitched()
