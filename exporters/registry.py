@@ -20,6 +20,7 @@ from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.execution.stage_clock import StageClock
 from smust3r_colmap.exporters.colmap_sparse import write_colmap_sparse
 from smust3r_colmap.exporters.dense_workspace import write_dense_workspace
+from smust3r_colmap.exporters.finished_run import FinishedRun, write_finished
 from smust3r_colmap.exporters.glb import write_glb
 from smust3r_colmap.exporters.mesh import MeshMethod, write_mesh
 from smust3r_colmap.exporters.ply import write_ply
@@ -30,7 +31,6 @@ from smust3r_colmap.products import FusedScene, ImageCollection, Scene
 from smust3r_colmap.refinement.stage import InitialScenes, Refinement
 from smust3r_colmap.storage.atomic_write import atomic_file, atomic_folder, write_atomically
 from smust3r_colmap.storage.config_file import config_to_toml
-from smust3r_colmap.storage.finished_run import FinishedRun, write_finished
 
 TRAINER_FOLDER, DENSE_FOLDER, DATABASE_FILE = "trainer", "dense", "database.db"
 _NAMES_SHOWN = 3

@@ -22,9 +22,9 @@ from smust3r_colmap.importers.image_folder import (
     check_output_not_inside,
     collection_from_scan,
 )
+from smust3r_colmap.importers.image_scan import scan_changed_files
 from smust3r_colmap.importers.masks import names_without_mask, with_masks
 from smust3r_colmap.products import ImageCollection
-from smust3r_colmap.storage.image_scan import scan_changed_files
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,13 +28,13 @@ from smust3r_colmap.execution.progress import Reporter
 from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.execution.task_pool import usable_cores
 from smust3r_colmap.exporters import registry as exporters
+from smust3r_colmap.exporters.finished_run import begin_stages
 from smust3r_colmap.importers import stage as importers
 from smust3r_colmap.refinement import stage as refinement
 from smust3r_colmap.report import summarise as report
 from smust3r_colmap.report.summary import RunSummary
 from smust3r_colmap.segmentation import stage as segmentation
 from smust3r_colmap.stitching import stage as stitching
-from smust3r_colmap.storage.finished_run import begin_stages
 
 
 def reconstruct(
@@ -65,7 +65,7 @@ def reconstruct(
         scan, collection = importers.read_images(run, images, config, overwrite=overwrite)
         backbone = backbones.make(run, factory, collection, config)
         begin_stages(run.folder, scan, overwrite=overwrite)
-        segments = segmentation.plan(run, backbone, len(collection), config.segmentation, config.loop_closing)
+        segments = segmentation.plan(run, len(collection), backbone.describe, config.segmentation, config.loop_closing)
         submodels = backbones.reconstruct(backbone, segments, collection, config.alignment)
         edges = alignment.align(run, submodels, segments, config.alignment)
         stitched = stitching.stitch(run, submodels, edges, segments, collection, config.alignment, config.loop_closing)

@@ -21,6 +21,7 @@ from smust3r_colmap.execution.progress import Reporter
 from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.execution.task_pool import usable_cores
 from smust3r_colmap.exporters import registry as exporters
+from smust3r_colmap.exporters.finished_run import begin_stages
 from smust3r_colmap.features.stage import match_external
 from smust3r_colmap.importers import stage as importers
 from smust3r_colmap.importers.colmap_model import read_colmap_model
@@ -28,7 +29,6 @@ from smust3r_colmap.importers.stage import CameraChoice
 from smust3r_colmap.refinement import stage as refinement
 from smust3r_colmap.report import summarise as report
 from smust3r_colmap.report.summary import RunSummary
-from smust3r_colmap.storage.finished_run import begin_stages
 
 
 def refine_model(

@@ -18,8 +18,8 @@ from smust3r_colmap.errors import ConfigError, InputError
 from smust3r_colmap.execution.progress import Reporter
 
 if TYPE_CHECKING:
+    from smust3r_colmap.exporters.finished_run import FinishedRun
     from smust3r_colmap.exporters.registry import FormatSettings
-    from smust3r_colmap.storage.finished_run import FinishedRun
     from smust3r_colmap.storage.run_directory import RunDirectory
 
 FormatName = Literal["sparse", "database", "ply", "glb", "tum", "trainer", "dense", "mesh", "list"]
@@ -69,8 +69,8 @@ def run_export(command: Export, reporter: Reporter) -> int:
             this run cannot be written in one of the formats; the formats before it are written.
         MissingDependencyError, ReconstructionError, RunDirectoryError: as the format says.
     """
+    from smust3r_colmap.exporters.finished_run import check_is_finished, open_finished  # noqa: PLC0415
     from smust3r_colmap.exporters.registry import FORMATS  # noqa: PLC0415  (heavy: --help shall not pay for it)
-    from smust3r_colmap.storage.finished_run import check_is_finished, open_finished  # noqa: PLC0415
     from smust3r_colmap.storage.run_directory import RunDirectory  # noqa: PLC0415
 
     taken_for_run = _format_taken_for_run(command)
@@ -122,9 +122,9 @@ def _settings(command: Export) -> FormatSettings:
 
 def _check_before(run: RunDirectory, finished: FinishedRun, names: Sequence[str], settings: FormatSettings) -> None:
     """Whatever can be refused before the first format is written."""
+    from smust3r_colmap.exporters.finished_run import check_images, check_masks_of_run  # noqa: PLC0415
     from smust3r_colmap.exporters.registry import FORMATS  # noqa: PLC0415  (as above)
     from smust3r_colmap.importers.image_folder import check_output_not_inside  # noqa: PLC0415
-    from smust3r_colmap.storage.finished_run import check_images, check_masks_of_run  # noqa: PLC0415
 
     if any(FORMATS[name].reads_images for name in names):
         check_images(run, finished)

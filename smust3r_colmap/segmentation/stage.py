@@ -5,12 +5,13 @@ The next module to read is ``windows``.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
-from smust3r_colmap.backbones.base import Backbone
 from smust3r_colmap.config import LoopConfig, SegmentationConfig
 from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.execution.run_context import Run
+from smust3r_colmap.geometry.arrays import Float32Array
 from smust3r_colmap.products import Segment
 from smust3r_colmap.segmentation.loop_segments import LoopPlan, plan_loops
 from smust3r_colmap.segmentation.windows import plan_windows
@@ -45,13 +46,21 @@ class Segments:
 
 
 def plan(
-    run: Run, backbone: Backbone, num_images: int, segmentation: SegmentationConfig, loop_closing: LoopConfig
+    run: Run,
+    num_images: int,
+    describe: Callable[[], Float32Array],
+    segmentation: SegmentationConfig,
+    loop_closing: LoopConfig,
 ) -> Segments:
-    """Windows, and the loops among images that look alike though far apart in the sequence."""
+    """Windows, and the loops among images that look alike though far apart in the sequence.
+
+    Args:
+        describe: (N, D) unit vectors, one per image; called where loops are wanted.
+    """
     windows = plan_windows(num_images, segment_length=segmentation.segment_length, overlap=segmentation.overlap)
     if not loop_closing.loops:
         return Segments(windows=windows, loops=NOT_LOOKED_FOR)
-    descriptors = backbone.describe()
+    descriptors = describe()
 
     def compute(progress: Stage) -> LoopPlan:
         planned = plan_loops(

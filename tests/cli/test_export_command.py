@@ -32,8 +32,8 @@ from smust3r_colmap.execution.progress import QuietReporter
 from smust3r_colmap.execution.stage_clock import StageClock
 from smust3r_colmap.exporters import registry as exports
 from smust3r_colmap.exporters.dense_workspace import DenseReport
+from smust3r_colmap.exporters.finished_run import FinishedRun, open_finished
 from smust3r_colmap.exporters.registry import FORMATS, FormatSettings, Written, write_where_possible
-from smust3r_colmap.storage.finished_run import FinishedRun, open_finished
 from smust3r_colmap.storage.run_directory import RunDirectory
 
 

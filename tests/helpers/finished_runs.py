@@ -26,6 +26,7 @@ from helpers.tracked_scenes import (
     write_features,
 )
 from smust3r_colmap.config import ImportConfig
+from smust3r_colmap.exporters.finished_run import FinishedRun, write_finished
 from smust3r_colmap.exporters.registry import FORMATS, FormatSettings
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
@@ -34,7 +35,6 @@ from smust3r_colmap.importers.image_folder import collection_from_scan, scan_ima
 from smust3r_colmap.products import FusedScene, ImageCollection, PointCloud
 from smust3r_colmap.refinement.global_refinement import RefinedFigures, RefineTask, refine_scenes
 from smust3r_colmap.storage.depth_maps import DepthMapWriter, StoredDepthMaps
-from smust3r_colmap.storage.finished_run import FinishedRun, write_finished
 from smust3r_colmap.storage.run_directory import DATABASE_FILE, MODEL_FOLDER, RunDirectory, key_of, write_json
 from smust3r_colmap.storage.scenes import FUSED_SCENES
 

@@ -15,10 +15,10 @@ from typing import Any
 from smust3r_colmap.colmap.model_files import MODEL_FILES
 from smust3r_colmap.errors import CollectionError, ImageError, InputError, RunDirectoryError
 from smust3r_colmap.importers.image_folder import FolderScan, ImportRecord
+from smust3r_colmap.importers.image_scan import store_scan
 from smust3r_colmap.importers.masks import MaskSet, check_masks
 from smust3r_colmap.products import DepthMaps, Scene
 from smust3r_colmap.storage.depth_maps import StoredDepthMaps
-from smust3r_colmap.storage.image_scan import store_scan
 from smust3r_colmap.storage.run_directory import (
     DATABASE_FILE,
     IMPORT_STAGE,

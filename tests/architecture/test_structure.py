@@ -1,0 +1,93 @@
+"""Imports between rooms go one way, and inside a stage's room only ``stage.py`` knows settings and clock."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from show_structure import PACKAGE, arrows, circles, imports_of, modules, room_of
+
+ORDER = (
+    # foundations: they know no stage
+    PACKAGE,
+    "errors",
+    "config",
+    "geometry",
+    "products",
+    "estimators",
+    "colmap",
+    "storage",
+    "execution",
+    # stages, in the order of the method
+    "importers",
+    "evaluation",
+    "features",
+    "segmentation",
+    "backbones",
+    "alignment",
+    "stitching",
+    "refinement",
+    "dense",
+    "exporters",
+    # what looks at results
+    "report",
+    "validation",
+    "synthetic",
+    # tables of contents, and the command line
+    "pipeline",
+    "refine_model",
+    "cli",
+    "__main__",
+)
+"""A room imports from rooms before it only."""
+
+STAGES = ("segmentation", "backbones", "alignment", "stitching", "refinement", "dense", "features")
+
+
+def test_every_room_has_its_place_in_the_order() -> None:
+    rooms = {room_of(module) for module in modules()}
+    assert rooms == set(ORDER)
+
+
+def test_imports_go_one_way() -> None:
+    place = {room: k for k, room in enumerate(ORDER)}
+    upward = [one for (a, b), imports in arrows().items() if place[a] < place[b] for one in imports]
+    assert not upward, upward
+
+
+def test_there_is_no_circle() -> None:
+    assert circles(arrows()) == []
+
+
+@pytest.mark.parametrize("room", STAGES)
+def test_only_the_stage_of_a_room_knows_the_clock(room: str) -> None:
+    known = modules()
+    knowing = [
+        module
+        for module, path in known.items()
+        if room_of(module) == room
+        and any(one.endswith((".run_context", ".stage_clock")) for one in imports_of(path, known))
+    ]
+    allowed = {f"{PACKAGE}.{room}.stage"}
+    if room == "backbones":  # a backbone is a stage of its own
+        allowed |= {f"{PACKAGE}.backbones.{name}" for name in ("base", "feed_forward", "classical.backbone")}
+    if room == "dense":  # a second entry, for models of other programs
+        allowed.add(f"{PACKAGE}.dense.external_points")
+    assert set(knowing) <= allowed
+
+
+def test_circles_and_upward_imports_are_seen(tmp_path: Path) -> None:
+    for name, text in {
+        "a/one.py": "from smust3r_colmap.b import two\n",
+        "b/two.py": "def f():\n    import smust3r_colmap.c.three\n",
+        "c/three.py": "from smust3r_colmap.a.one import x\n",
+        "d/four.py": "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from smust3r_colmap.a.one import x\n",
+    }.items():
+        path = tmp_path / PACKAGE / name
+        path.parent.mkdir(parents=True)
+        path.write_text(text)
+    for linked in ("exporters", "importers"):
+        (tmp_path / linked).mkdir()
+    found = arrows(tmp_path)
+    assert set(found) == {("a", "b"), ("b", "c"), ("c", "a")}
+    assert circles(found) == [("a", "b", "c")]
