@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from smust3r_colmap.validation.description import CAMERA_MODELS, Camera, Subject
-from smust3r_colmap.validation.rules import Evidence, Severity, measured, offenders, rule
+from smust3r_colmap.validation.rules import Evidence, Rule, Severity, measured, offenders, rule
 
 _UNDISTORT = (
     "undistort the images and the model (pycolmap.undistort_images, COLMAP's image_undistorter), "
@@ -31,17 +31,13 @@ def camera_model_rule(model: str) -> str:
     return f"camera-model-{model}"
 
 
-def _register_model_rule(model: str) -> None:
+def _camera_model_rule(model: str) -> Rule:
+    @rule(camera_model_rule(model), f"camera model {model}", severity=Severity.FACT, advice=_UNDISTORT)
     def check(subject: Subject) -> Evidence | None:
         found = [f"camera {camera.camera_id}" for camera in subject.model.cameras if camera.model == model]
         return offenders(found, of=len(subject.model.cameras), unit="cameras")
 
-    register = rule(camera_model_rule(model), f"camera model {model}", severity=Severity.FACT, advice=_UNDISTORT)
-    register(check)
-
-
-for _model in CAMERA_MODELS:
-    _register_model_rule(_model)
+    return check
 
 
 @rule(
@@ -238,3 +234,21 @@ def _known(camera: Camera) -> bool:
 
 def _cameras(subject: Subject, found: list[str]) -> Evidence | None:
     return offenders(found, of=len(subject.model.cameras), unit="cameras")
+
+
+RULES = (
+    *map(_camera_model_rule, CAMERA_MODELS),
+    _unknown_model,
+    _missing,
+    _unused,
+    _per_image,
+    _id_not_one,
+    _mixed,
+    _size_zero,
+    _off_centre,
+    _other_resolution,
+    _focal_absurd,
+    _focal_unequal,
+    _distortion_absurd,
+)
+"""In the order in which they are reported."""

@@ -129,3 +129,15 @@ def _pairs(subject: Subject) -> Iterator[tuple[int, DatabaseImage]]:
     for index, name in enumerate(subject.model.images.names):
         if name in by_name:
             yield index, by_name[name]
+
+
+RULES = (
+    _unreadable,
+    _missing,
+    _image_id,
+    _camera_id,
+    _frame_id,
+    _keypoints,
+    _camera,
+)
+"""In the order in which they are reported."""

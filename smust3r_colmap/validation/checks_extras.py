@@ -244,3 +244,21 @@ def _normals_missing(subject: Subject) -> Evidence | None:
         return None
     found = sorted(set(subject.dense.depth_sizes) - subject.dense.normal_maps)
     return offenders(found, of=len(subject.dense.depth_sizes), unit="maps")
+
+
+RULES = (
+    _ply_unreadable,
+    _ply_incomplete,
+    _ply_stale,
+    _depth_unreadable,
+    _params_without_png,
+    _png_without_params,
+    _depth_scale,
+    _mask_missing,
+    _mask_naming,
+    _mask_size,
+    _fusion_names,
+    _map_sizes,
+    _normals_missing,
+)
+"""In the order in which they are reported."""

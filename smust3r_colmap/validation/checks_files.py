@@ -189,3 +189,24 @@ def _without_number(subject: Subject) -> Evidence | None:
 )
 def _unread(subject: Subject) -> Evidence | None:
     return measured(subject.unread_by_colmap[:_SHOWN_MESSAGE]) if subject.unread_by_colmap else None
+
+
+RULES = (
+    _unreadable,
+    _truncated,
+    _trailing,
+    _no_images,
+    _no_points_file,
+    _rigs_incomplete,
+    _text_only,
+    _bad_line,
+    _odd_lines,
+    _last_line_empty,
+    _text_simple_pinhole,
+    _forms_differ,
+    _not_largest,
+    _several,
+    _without_number,
+    _unread,
+)
+"""In the order in which they are reported."""

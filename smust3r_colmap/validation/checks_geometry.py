@@ -277,3 +277,23 @@ def _points(subject: Subject, wrong: BoolArray) -> Evidence | None:
     x, y, z = points.xyz[found[0]]
     example = f"point {points.ids[found[0]]} at ({x:.4g}, {y:.4g}, {z:.4g})"
     return Evidence(count=len(found), of=len(points), unit="points", example=example)
+
+
+RULES = (
+    _pose_not_finite,
+    _quaternion,
+    _camera_not_finite,
+    _point_not_finite,
+    _observation_not_finite,
+    _behind,
+    _looks_away,
+    _reprojection,
+    _far_cameras,
+    _far_points,
+    _large,
+    _colourless,
+    _rig_not_trivial,
+    _frame_dangling,
+    _frame_pose,
+)
+"""In the order in which they are reported."""

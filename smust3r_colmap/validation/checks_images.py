@@ -177,3 +177,17 @@ def _pairs(subject: Subject, *, readable: bool = True) -> Iterator[tuple[str, Ca
     for name, camera_id in zip(images.names, images.camera_ids.tolist(), strict=True):
         if name in files and camera_id in cameras and (files[name].readable or not readable):
             yield name, cameras[camera_id], files[name]
+
+
+RULES = (
+    _missing,
+    _extra,
+    _unreadable,
+    _resized,
+    _differs,
+    _turned,
+    _turned_camera,
+    _downscaled_lists,
+    _downscaled_sizes,
+)
+"""In the order in which they are reported."""

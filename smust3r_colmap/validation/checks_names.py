@@ -34,7 +34,7 @@ def _has_blank(name: str) -> bool:
     advice="rename the images; text has a name end at the first blank",
 )
 def _blank_in_text(subject: Subject) -> Evidence | None:
-    return _blank(subject) if subject.model.form == "text" else None
+    return _names(subject, _has_blank) if subject.model.form == "text" else None
 
 
 @rule("name-comma", "commas in names", severity=Severity.FACT, advice="rename the images without commas")
@@ -214,3 +214,22 @@ def _ids(subject: Subject) -> tuple[tuple[str, list[int]], ...]:
         ("image", model.images.ids.tolist()),
         ("point", [] if model.points is None else model.points.ids.tolist()),
     )
+
+
+RULES = (
+    _blank,
+    _blank_in_text,
+    _comma,
+    _subfolder,
+    _two_dots,
+    _not_relative,
+    _duplicate,
+    _case_clash,
+    _stem_clash,
+    _ending_clash,
+    _duplicate_id,
+    _zero_id,
+    _large_id,
+    _huge_point_id,
+)
+"""In the order in which they are reported."""

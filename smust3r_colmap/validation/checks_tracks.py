@@ -260,3 +260,22 @@ def _points_where(subject: Subject, wrong: Callable[[Points], BoolArray]) -> Evi
     if len(found) == 0:
         return None
     return Evidence(count=len(found), of=len(points), unit="points", example=f"point {points.ids[found[0]]}")
+
+
+RULES = (
+    _no_points,
+    _no_track,
+    _no_tracks_at_all,
+    _single,
+    _short,
+    _pseudo_zero,
+    _repeats,
+    _dangling,
+    _disagrees,
+    _observation_dangling,
+    _one_sided,
+    _outside,
+    _unobserved,
+    _weak,
+)
+"""In the order in which they are reported."""

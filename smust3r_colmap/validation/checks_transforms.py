@@ -281,3 +281,21 @@ def _name_in_model(transforms: TransformsFile, frame: TransformsFrame, names: Co
     path = PurePosixPath(with_ending.name if with_ending else frame.file_path)
     candidates = (str(path), str(PurePosixPath(*path.parts[1:])), path.name)
     return next((name for name in candidates if name in names), "")
+
+
+RULES = (
+    _unreadable,
+    _comments,
+    _image_missing,
+    _sharp_image_missing,
+    _image_ending,
+    _masks_incomplete,
+    _points_missing,
+    _camera_model,
+    _intrinsics,
+    _size_differs,
+    _pose_not_rigid,
+    _images_differ,
+    _cameras_differ,
+)
+"""In the order in which they are reported."""

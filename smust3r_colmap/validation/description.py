@@ -16,6 +16,7 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+import pycolmap
 
 from smust3r_colmap.geometry.arrays import BoolArray, FloatArray, IntArray
 
@@ -25,7 +26,7 @@ NO_POINT = -1
 
 @dataclass(frozen=True, kw_only=True)
 class CameraModel:
-    """What the files say with a model's number or name (COLMAP, ``sensor/models.h``).
+    """What the files say with a model's number or name.
 
     Args:
         number: in binary files and databases.
@@ -37,31 +38,32 @@ class CameraModel:
     number: int
     num_params: int
     num_focal: int
-    perspective: bool = True
-    fractional: bool = True
+    perspective: bool
+    fractional: bool
 
 
-CAMERA_MODELS: Mapping[str, CameraModel] = {
-    "SIMPLE_PINHOLE": CameraModel(number=0, num_params=3, num_focal=1),
-    "PINHOLE": CameraModel(number=1, num_params=4, num_focal=2),
-    "SIMPLE_RADIAL": CameraModel(number=2, num_params=4, num_focal=1),
-    "RADIAL": CameraModel(number=3, num_params=5, num_focal=1),
-    "OPENCV": CameraModel(number=4, num_params=8, num_focal=2),
-    "OPENCV_FISHEYE": CameraModel(number=5, num_params=8, num_focal=2, perspective=False),
-    "FULL_OPENCV": CameraModel(number=6, num_params=12, num_focal=2, fractional=False),
-    "FOV": CameraModel(number=7, num_params=5, num_focal=2, perspective=False, fractional=False),
-    "SIMPLE_RADIAL_FISHEYE": CameraModel(number=8, num_params=4, num_focal=1, perspective=False),
-    "RADIAL_FISHEYE": CameraModel(number=9, num_params=5, num_focal=1, perspective=False),
-    "THIN_PRISM_FISHEYE": CameraModel(number=10, num_params=12, num_focal=2, perspective=False),
-    "RAD_TAN_THIN_PRISM_FISHEYE": CameraModel(number=11, num_params=16, num_focal=2, perspective=False),
-    "SIMPLE_DIVISION": CameraModel(number=12, num_params=4, num_focal=1),
-    "DIVISION": CameraModel(number=13, num_params=5, num_focal=2),
-    "SIMPLE_FISHEYE": CameraModel(number=14, num_params=3, num_focal=1, perspective=False),
-    "FISHEYE": CameraModel(number=15, num_params=4, num_focal=2, perspective=False),
-    "EUCM": CameraModel(number=16, num_params=6, num_focal=2, perspective=False, fractional=False),
-    "EQUIRECTANGULAR": CameraModel(number=17, num_params=2, num_focal=0, perspective=False, fractional=False),
-}
+def _camera_models() -> dict[str, CameraModel]:
+    """All models that pycolmap knows, by name, in the order of their numbers."""
+    found = {}
+    for name, model_id in pycolmap.CameraModelId.__members__.items():
+        if name != "INVALID":
+            camera = pycolmap.Camera.create_from_model_id(1, model_id, 1.0, 2, 2)
+            found[name] = CameraModel(
+                number=model_id.value,
+                num_params=len(camera.params),
+                num_focal=len(camera.focal_length_idxs()),
+                perspective=camera.is_perspective_pinhole() and name not in _NOT_ON_A_PLANE,
+                fractional=name not in _LARGE_DISTORTIONS,
+            )
+    return dict(sorted(found.items(), key=lambda item: item[1].number))
 
+
+_NOT_ON_A_PLANE = frozenset({"FOV", "EUCM"})
+"""They do not start from x/z and y/z, although pycolmap counts them with the pinhole cameras."""
+_LARGE_DISTORTIONS = frozenset({"FULL_OPENCV", "FOV", "EUCM"})
+"""A rational function, an angle, and a shape: none of them small for real lenses."""
+
+CAMERA_MODELS: Mapping[str, CameraModel] = _camera_models()
 MODEL_NAMES: Mapping[int, str] = {model.number: name for name, model in CAMERA_MODELS.items()}
 
 

@@ -1,8 +1,8 @@
 """Rules: each looks at a described model for one thing and says what it found.
 
-A rule is a function with a decorator; to add one, write it into the ``checks_*`` module where it
-belongs. It knows nothing of programs: ``readers`` says who minds which rule. The functions are pure
-and get whatever is there, so that a check of the images must cope with having no image folder.
+A rule is a function with a decorator; to add one, write it into the ``checks_*`` module where it belongs and into the
+tuple ``RULES`` at the end of that module. It knows nothing of programs: ``readers`` says who minds which rule. The
+functions are pure and get whatever is there, so that a check of the images must cope with having no image folder.
 The next module to read is ``checks_files``, then the others of that name.
 """
 
@@ -78,24 +78,25 @@ class Rule:
     check: Check
 
 
-RULES: dict[str, Rule] = {}
-"""By name, in the order in which they are reported; ``validate`` imports the modules that fill it."""
-
-
 UNREAD_RULE = "file-unreadable"
 """Of a model with a file in which nothing can be read; most other rules would say that again in other words."""
 
 
-def rule(name: str, title: str, *, severity: Severity, advice: str) -> Callable[[Check], Check]:
-    """Register the decorated function as the check of a new rule."""
+def rule(name: str, title: str, *, severity: Severity, advice: str) -> Callable[[Check], Rule]:
+    """Make the decorated function the check of a rule, which takes the function's name."""
+    return lambda check: Rule(name=name, title=title, severity=severity, advice=advice, check=check)
 
-    def register(check: Check) -> Check:
-        if name in RULES:
-            raise ValueError(f"there are two rules {name!r}")
-        RULES[name] = Rule(name=name, title=title, severity=severity, advice=advice, check=check)
-        return check
 
-    return register
+def by_name(*rules: Rule) -> dict[str, Rule]:
+    """The rules by their names, in the same order.
+
+    Raises:
+        ValueError: two have the same name.
+    """
+    named = {rule.name: rule for rule in rules}
+    if len(named) < len(rules):
+        raise ValueError("two rules have the same name")
+    return named
 
 
 def offenders(found: Sequence[str], *, of: int, unit: str) -> Evidence | None:

@@ -32,7 +32,7 @@ from smust3r_colmap.validation.layout import Layout, UnreadableModelError, find_
 from smust3r_colmap.validation.projection import project
 from smust3r_colmap.validation.readers import READERS, Reader
 from smust3r_colmap.validation.report import Report, judge, measure, verdicts
-from smust3r_colmap.validation.rules import RULES, apply_rules
+from smust3r_colmap.validation.rules import apply_rules, by_name
 from smust3r_colmap.validation.surroundings import (
     read_database,
     read_dense,
@@ -42,11 +42,18 @@ from smust3r_colmap.validation.surroundings import (
 )
 from smust3r_colmap.validation.transforms_file import read_transforms
 
-_CHECKS = (
-    *(checks_files, checks_names, checks_cameras, checks_tracks, checks_geometry),
-    *(checks_images, checks_database, checks_extras, checks_transforms),
+RULES = by_name(
+    *checks_files.RULES,
+    *checks_names.RULES,
+    *checks_cameras.RULES,
+    *checks_tracks.RULES,
+    *checks_geometry.RULES,
+    *checks_images.RULES,
+    *checks_database.RULES,
+    *checks_extras.RULES,
+    *checks_transforms.RULES,
 )
-"""The modules of the rules, which register themselves when they are imported; a new one is added here."""
+"""By name, in the order in which they are reported."""
 
 _POSE_TOLERANCE = 1e-6
 _UNREAD = frozenset({"file-truncated", "text-bad-line"})

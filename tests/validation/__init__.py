@@ -1,0 +1,1 @@
+"""A package, so that its conftest and its files may have names that other rooms have, too."""
