@@ -38,9 +38,11 @@ from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.alignment.from_pointmaps import NUM_PIXELS, align_pointmaps
 from smust3r_colmap.alignment.seen_points import SubmodelFit, align_seen_points
-from smust3r_colmap.config import AlignmentConfig, TransformGroup
+from smust3r_colmap.estimators.confidence import ConfidenceWeighting
+from smust3r_colmap.estimators.robust import RobustKernel, RobustLoss
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
+from smust3r_colmap.geometry.groups import TransformGroup
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.sl4 import SL4
 from smust3r_colmap.geometry.transform import Transform
@@ -82,10 +84,20 @@ OVERLAPS = (
     replace(BLOB_30, label="blob 30 %, scene x100", unit=100.0, peer=(17.8, 0.11, 3.1, 7.7)),
     replace(BLOB_30, label="blob 30 %, 1.7 km away", far_m=FAR_AWAY_M, peer=(18.8, 0.9, 9.8, 28.0)),
 )
-DEFAULT = AlignmentConfig()
-CAUCHY_ALONE = AlignmentConfig(confidence_weighting="off")
-TUKEY_ALONE = AlignmentConfig(confidence_weighting="off", robust_kernel="tukey")
-PAPER_HUBER = AlignmentConfig(confidence_weighting="off", robust_kernel="huber")
+
+
+@dataclass(frozen=True)
+class Method:
+    """How pointmaps are aligned."""
+
+    kernel: RobustKernel = "cauchy"
+    weighting: ConfidenceWeighting = "off"
+
+
+DEFAULT = Method(weighting="relative")
+CAUCHY_ALONE = Method()
+TUKEY_ALONE = Method(kernel="tukey")
+PAPER_HUBER = Method(kernel="huber")
 CASES = (
     *(("default", overlap, DEFAULT) for overlap in OVERLAPS),
     ("cauchy alone", BLOB_30, CAUCHY_ALONE),
@@ -304,12 +316,18 @@ def overlap_maps(
     return target_maps, source_maps, target_from_room
 
 
-def score_maps(room: Room, overlap: Overlap, settings: AlignmentConfig, *, num_pixels: int, seed: int) -> Score:
+def score_maps(room: Room, overlap: Overlap, method: Method, *, num_pixels: int, seed: int) -> Score:
     """Make both segments, align them, compare with the truth."""
     target_maps, source_maps, target_from_room = overlap_maps(room, overlap, SOURCE_FROM_TARGET, seed=seed)
     began = time.process_time()
     fit = align_pointmaps(
-        as_submodel(room, 0), as_submodel(room, 1), target_maps, source_maps, settings, num_pixels=num_pixels
+        as_submodel(room, 0),
+        as_submodel(room, 1),
+        target_maps,
+        source_maps,
+        loss=RobustLoss(kernel=method.kernel),
+        weighting=method.weighting,
+        num_pixels=num_pixels,
     )
     cpu_s = time.process_time() - began
     return score_fit(room, fit, target_from_room, SOURCE_FROM_TARGET @ target_from_room, cpu_s)
@@ -385,8 +403,6 @@ def score_cloud(room: Room, cloud: Cloud, group: TransformGroup, *, seed: int) -
         np.ones(len(chosen)),
         depth_source=float(source_from_room.scale) * depth_source,
         depth_target=float(target_from_room.scale) * depth_target,
-        kernel="cauchy",
-        huber_delta=0.1,
         group=group,
         seed=seed,
     )
@@ -399,10 +415,10 @@ def print_similarity(room: Room, arguments: argparse.Namespace) -> None:
     columns = f"{'cpu s':>7} {'rot deg':>8} {'scale %':>8} {'map cm':>7}"
     print(f"{'':38} {'ours':^33} {'':>12} | {'VGGT-Long':^33}")
     print(f"{'case':38} {columns} {'resid/depth':>12} | {columns}")
-    for name, overlap, settings in CASES:
-        dense = arguments.all_pixels and settings is PAPER_HUBER
+    for name, overlap, method in CASES:
+        dense = arguments.all_pixels and method is PAPER_HUBER
         num_pixels = room.depth_m.size if dense else NUM_PIXELS
-        ours = score_maps(room, overlap, settings, num_pixels=num_pixels, seed=arguments.seed)
+        ours = score_maps(room, overlap, method, num_pixels=num_pixels, seed=arguments.seed)
         line = f"{ours.cpu_s:7.3f} {ours.rotation_deg:8.3f} {ours.scale_percent:8.3f} {ours.map_cm:7.2f}"
         peer = "{:7.1f} {:8.3f} {:8.2f} {:7.2f}".format(*overlap.peer)
         print(f"{name + ': ' + overlap.label:38} {line} {ours.relative_residual:12.4f} | {peer}", flush=True)
@@ -421,8 +437,7 @@ def print_groups(room: Room, arguments: argparse.Namespace) -> None:
         def align(
             group: TransformGroup = group, target: MapsInMemory = target_maps, source: MapsInMemory = source_maps
         ) -> SubmodelFit:
-            settings = AlignmentConfig(transform_group=group)
-            return align_pointmaps(as_submodel(room, 0), as_submodel(room, 1), target, source, settings)
+            return align_pointmaps(as_submodel(room, 0), as_submodel(room, 1), target, source, group=group)
 
         began = time.process_time()
         fit = align()

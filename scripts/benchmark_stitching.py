@@ -32,6 +32,7 @@ from dataclasses import dataclass, replace
 import benchmark_alignment
 import numpy as np
 
+from smust3r_colmap.estimators.similarity import fit_similarity
 from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.sl4 import SL4
@@ -134,11 +135,7 @@ def accumulated(graph: PoseGraph) -> Transform:
 def ate(truth: Transform, found: Transform) -> float:
     """Root mean square distance of the nodes' origins after the best Sim(3) (Umeyama)."""
     a, b = (transform.apply(np.zeros((1, 3)))[:, 0] for transform in (found, truth))
-    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
-    u, values, vt = np.linalg.svd(b.T @ a)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    scale = (values * signs).sum() / (a**2).sum()
-    return float(np.sqrt(((b - scale * a @ ((u * signs) @ vt).T) ** 2).sum(axis=1).mean()))
+    return float(np.sqrt(((b - fit_similarity(a, b).apply(a)) ** 2).sum(axis=1).mean()))
 
 
 def mean_turn_deg(truth: Sim3, found: Transform) -> float:

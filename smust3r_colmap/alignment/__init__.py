@@ -1,2 +1,2 @@
-"""Transforms between segments that share images. ``irls`` has the solver, ``seen_points`` chooses the group,
-the others find correspondences."""
+"""Transforms between submodels that share images: ``pairwise`` has the edges, ``seen_points`` the choice of group,
+the others the correspondences and the covariance. The solvers are in ``estimators``."""

@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 from smust3r_colmap.alignment.seen_points import SubmodelFit, align_seen_points
-from smust3r_colmap.config import AlignmentConfig, ConfidenceWeighting
 from smust3r_colmap.errors import DegenerateAlignmentError, ReconstructionError
-from smust3r_colmap.estimators.confidence import reweighted
-from smust3r_colmap.estimators.robust import evenly_chosen
+from smust3r_colmap.estimators.confidence import ConfidenceWeighting, reweighted
+from smust3r_colmap.estimators.robust import CAUCHY, RobustLoss, evenly_chosen
 from smust3r_colmap.geometry.arrays import FloatArray
+from smust3r_colmap.geometry.groups import TransformGroup
 from smust3r_colmap.products import DenseMaps, Submodel
 
 NUM_PIXELS = 8_000
@@ -62,8 +62,10 @@ def align_pointmaps(
     source: Submodel,
     target_maps: DenseMaps,
     source_maps: DenseMaps,
-    settings: AlignmentConfig,
     *,
+    loss: RobustLoss = CAUCHY,
+    group: TransformGroup = "sim3",
+    weighting: ConfidenceWeighting = "relative",
     num_pixels: int = NUM_PIXELS,
     seed: int = 0,
 ) -> SubmodelFit:
@@ -77,7 +79,8 @@ def align_pointmaps(
     Args:
         target, source: submodels that share images.
         target_maps, source_maps: of their images, in the same order; read one image at a time.
-        settings: kernel and weighting.
+        loss, group: as for `align_seen_points`.
+        weighting: of the confidences, see `reweighted`.
         num_pixels: at most this many correspondences.
         seed: of the search for a robust start.
 
@@ -99,7 +102,7 @@ def align_pointmaps(
             target, source, target_maps, source_maps, shared=shared, candidates_per_image=candidates_per_image
         )
     )
-    weights = np.concatenate([_weights(t, s, settings.confidence_weighting) for t, s in sides])
+    weights = np.concatenate([_weights(t, s, weighting) for t, s in sides])
     on_target, on_source = _concatenated([t for t, _ in sides]), _concatenated([s for _, s in sides])
     confident = np.flatnonzero(_confident(on_target) & _confident(on_source))
     chosen = confident[evenly_chosen(len(confident), num_pixels)]
@@ -111,9 +114,8 @@ def align_pointmaps(
             weights[chosen],
             depth_source=on_source.depth,
             depth_target=on_target.depth,
-            kernel=settings.robust_kernel,
-            huber_delta=settings.huber_delta,
-            group=settings.transform_group,
+            loss=loss,
+            group=group,
             seed=seed,
         )
     except DegenerateAlignmentError as error:

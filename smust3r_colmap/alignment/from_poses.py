@@ -14,10 +14,10 @@ from typing import Literal
 import numpy as np
 
 from smust3r_colmap.alignment.seen_points import SubmodelFit
-from smust3r_colmap.config import RobustKernel
 from smust3r_colmap.errors import DegenerateAlignmentError
-from smust3r_colmap.estimators.robust import CAUCHY_TUNING, MAD_TO_SIGMA, TRIMMING_ROUNDS, TUKEY_TUNING, evenly_chosen
+from smust3r_colmap.estimators.robust import MAD_TO_SIGMA, TRIMMING_ROUNDS, RobustKernel, RobustLoss, evenly_chosen
 from smust3r_colmap.estimators.sim3 import REDESCENDING_ITERATIONS
+from smust3r_colmap.estimators.similarity import CentredPairs
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3
@@ -104,7 +104,7 @@ def align_poses(
             "does not; needed 2 cameras, or a metric backbone (se3)"
         )
     try:
-        return _fit(pairs, kernel, fixed_scale=group == "se3")
+        return _fit(pairs, RobustLoss(kernel=kernel, huber_delta=HUBER_TUNING), fixed_scale=group == "se3")
     except DegenerateAlignmentError as error:
         raise DegenerateAlignmentError(f"{between}, {len(pairs)} shared cameras: {error}") from error
 
@@ -174,14 +174,14 @@ class _Terms:
     rotation_weights: FloatArray
 
 
-def _fit(pairs: _Cameras, kernel: RobustKernel, *, fixed_scale: bool) -> SubmodelFit:
+def _fit(pairs: _Cameras, loss: RobustLoss, *, fixed_scale: bool) -> SubmodelFit:
     """The estimate and its evidence."""
     fit = _start(pairs, fixed_scale=fixed_scale)
     iterations = 0
-    for stage in _stages(kernel):
+    for stage in loss.stages:
         fit, done, stop_reason = _reweighted(pairs, fit, stage, fixed_scale=fixed_scale)
         iterations += done
-    terms = _terms(pairs, fit, kernel, _sigmas(pairs, fit, fixed_scale=fixed_scale))
+    terms = _terms(pairs, fit, loss, _sigmas(pairs, fit, fixed_scale=fixed_scale))
     if not fixed_scale:
         _check_spread(pairs, fit, terms)
     distances, angles = pairs.residuals(fit)
@@ -202,11 +202,6 @@ def _fit(pairs: _Cameras, kernel: RobustKernel, *, fixed_scale: bool) -> Submode
         information=information,
     )
     return SubmodelFit(estimate=estimate, num_correspondences=len(pairs), relative_residual=float(np.median(distances)))
-
-
-def _stages(kernel: RobustKernel) -> tuple[RobustKernel, ...]:
-    """Tukey's kernel is blind beyond its cut and begins where Cauchy's ends."""
-    return ("cauchy", "tukey") if kernel == "tukey" else (kernel,)
 
 
 def _start(pairs: _Cameras, *, fixed_scale: bool) -> Sim3:
@@ -242,12 +237,12 @@ def _median_rotation(rotations: FloatArray) -> FloatArray:
     return median
 
 
-def _reweighted(pairs: _Cameras, fit: Sim3, kernel: RobustKernel, *, fixed_scale: bool) -> tuple[Sim3, int, str]:
+def _reweighted(pairs: _Cameras, fit: Sim3, loss: RobustLoss, *, fixed_scale: bool) -> tuple[Sim3, int, str]:
     """Fit again with the kernel's weights until the cameras rest: fit, iterations, why it stopped."""
     for iteration in range(1, REDESCENDING_ITERATIONS + 1):
         if iteration <= SCALE_ITERATIONS:
             sigmas = _sigmas(pairs, fit, fixed_scale=fixed_scale)
-        terms = _terms(pairs, fit, kernel, sigmas)
+        terms = _terms(pairs, fit, loss, sigmas)
         before, fit = fit, _closed_form(pairs, fit, terms, fixed_scale=fixed_scale)
         moved = np.linalg.norm(fit.apply(pairs.centres_a) - before.apply(pairs.centres_a), axis=1).max()
         turned = float(angles_between(fit.rotation, before.rotation))
@@ -256,15 +251,15 @@ def _reweighted(pairs: _Cameras, fit: Sim3, kernel: RobustKernel, *, fixed_scale
     return fit, REDESCENDING_ITERATIONS, "iteration limit"
 
 
-def _terms(pairs: _Cameras, fit: Sim3, kernel: RobustKernel, sigmas: tuple[float, float]) -> _Terms:
+def _terms(pairs: _Cameras, fit: Sim3, loss: RobustLoss, sigmas: tuple[float, float]) -> _Terms:
     """What the kernel leaves of each camera at a fit."""
     distances, angles = pairs.residuals(fit)
     centre_sigma, rotation_sigma = sigmas
     return _Terms(
         centre_sigma=centre_sigma,
         rotation_sigma=rotation_sigma,
-        centre_weights=_kernel_weights(distances / centre_sigma, kernel),
-        rotation_weights=_kernel_weights(angles / rotation_sigma, kernel),
+        centre_weights=loss.weights(distances / centre_sigma, 1.0),
+        rotation_weights=loss.weights(angles / rotation_sigma, 1.0),
     )
 
 
@@ -291,18 +286,6 @@ def _sigma(norms: FloatArray, num_parameters: int) -> float:
     return float(sigma)
 
 
-def _kernel_weights(ratios: FloatArray, kernel: RobustKernel) -> FloatArray:
-    """(N,) derivative of the loss over the residual, of residuals in standard deviations."""
-    weights: FloatArray
-    if kernel == "huber":
-        weights = HUBER_TUNING / np.maximum(ratios, HUBER_TUNING)
-    elif kernel == "tukey":
-        weights = np.maximum(1 - (ratios / TUKEY_TUNING) ** 2, 0.0) ** 2
-    else:
-        weights = 1 / (1 + (ratios / CAUCHY_TUNING) ** 2)
-    return weights
-
-
 def _closed_form(pairs: _Cameras, fit: Sim3, terms: _Terms, *, fixed_scale: bool) -> Sim3:
     """Weighted least squares with the scale of ``fit`` in the rotation, then a scale for that rotation.
 
@@ -310,18 +293,15 @@ def _closed_form(pairs: _Cameras, fit: Sim3, terms: _Terms, *, fixed_scale: bool
     both terms are linear in R, and one Procrustes problem holds them.
     """
     share = terms.centre_weights / terms.centre_weights.sum()
-    mean_a, mean_b = share @ pairs.centres_a, share @ pairs.centres_b
-    a, b = pairs.centres_a - mean_a, pairs.centres_b - mean_b
-    by_centres = float(fit.scale) * (terms.centre_weights[:, None] * b).T @ a / terms.centre_sigma**2
+    centred = CentredPairs.of(pairs.centres_a, pairs.centres_b, share)
+    by_centres = float(fit.scale) * centred.correlation(terms.centre_weights) / terms.centre_sigma**2
     by_rotations = np.einsum("n,nij,nkj->ik", terms.rotation_weights, pairs.rotations_b, pairs.rotations_a)
     rotation = nearest_rotation(by_centres + by_rotations / (2 * terms.rotation_sigma**2))
-    scale = float(fit.scale)
-    if not fixed_scale:
-        radius_a, radius_b = _radius(a, share**2), _radius(b, share**2)
-        if not (radius_a > 0 and radius_b > 0):
-            raise DegenerateAlignmentError("the cameras that agree stand in one place, which leaves the scale free")
-        scale = radius_b / radius_a
-    return Sim3(scale=np.array(scale), rotation=rotation, translation=mean_b - scale * rotation @ mean_a)
+    if fixed_scale:
+        return centred.similarity(rotation, float(fit.scale))
+    if not (_radius(centred.a, share**2) > 0 and _radius(centred.b, share**2) > 0):
+        raise DegenerateAlignmentError("the cameras that agree stand in one place, which leaves the scale free")
+    return centred.similarity(rotation, centred.symmetric_scale(share**2))
 
 
 def _radius(centred: FloatArray, weights: FloatArray) -> float:

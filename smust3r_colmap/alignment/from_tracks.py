@@ -11,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from smust3r_colmap.alignment.seen_points import SubmodelFit, align_seen_points
-from smust3r_colmap.config import AlignmentConfig
 from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.estimators.robust import CAUCHY, RobustLoss
 from smust3r_colmap.geometry.arrays import FloatArray, IntArray
+from smust3r_colmap.geometry.groups import TransformGroup
 from smust3r_colmap.products import Submodel, Tracks
 
 MAX_SHARED_OBSERVATIONS = 5
@@ -24,7 +25,9 @@ that the start asks for. Most matches between submodels may be wrong."""
 _KEY_SHIFT = np.int64(2**32)
 
 
-def align_tracks(target: Submodel, source: Submodel, settings: AlignmentConfig, *, seed: int = 0) -> SubmodelFit:
+def align_tracks(
+    target: Submodel, source: Submodel, *, loss: RobustLoss = CAUCHY, group: TransformGroup = "sim3", seed: int = 0
+) -> SubmodelFit:
     """Robust ``target_from_source`` from points that share an (image, feature) observation.
 
     Every pair of points counts once and weighs as many shared observations as it has, up to 5. With
@@ -32,7 +35,7 @@ def align_tracks(target: Submodel, source: Submodel, settings: AlignmentConfig, 
 
     Args:
         target, source: submodels with tracks.
-        settings: kernel.
+        loss, group: as for `align_seen_points`.
         seed: of the search for a robust start.
 
     Raises:
@@ -46,7 +49,8 @@ def align_tracks(target: Submodel, source: Submodel, settings: AlignmentConfig, 
         source,
         on_target.point_of_observation[row_target],
         on_source.point_of_observation[row_source],
-        settings,
+        loss=loss,
+        group=group,
         evidence="shared track points",
         max_start_error=np.inf,
         seed=seed,
@@ -56,12 +60,13 @@ def align_tracks(target: Submodel, source: Submodel, settings: AlignmentConfig, 
 def align_matches(
     target: Submodel,
     source: Submodel,
-    settings: AlignmentConfig,
     *,
     image_a: npt.ArrayLike,
     feature_a: npt.ArrayLike,
     image_b: npt.ArrayLike,
     feature_b: npt.ArrayLike,
+    loss: RobustLoss = CAUCHY,
+    group: TransformGroup = "sim3",
     seed: int = 0,
 ) -> SubmodelFit:
     """Robust ``target_from_source`` from two-view matches between images of the two submodels.
@@ -73,8 +78,8 @@ def align_matches(
 
     Args:
         target, source: submodels with tracks; they need not share an image.
-        settings: kernel.
         image_a, feature_a: (M,) in images of the target. image_b, feature_b: (M,) in images of the source.
+        loss, group: as for `align_seen_points`.
         seed: of the search for a robust start.
 
     Raises:
@@ -92,7 +97,8 @@ def align_matches(
         source,
         point_target[matched],
         point_source[matched],
-        settings,
+        loss=loss,
+        group=group,
         evidence="matched points",
         max_start_error=MAX_MATCH_RELATIVE_ERROR,
         seed=seed,
@@ -104,8 +110,9 @@ def _align_point_pairs(
     source: Submodel,
     point_target: IntArray,
     point_source: IntArray,
-    settings: AlignmentConfig,
     *,
+    loss: RobustLoss,
+    group: TransformGroup,
     evidence: str,
     max_start_error: float,
     seed: int,
@@ -122,9 +129,8 @@ def _align_point_pairs(
             np.minimum(counts, MAX_SHARED_OBSERVATIONS)[usable].astype(np.float64),
             depth_source=depth_source[usable],
             depth_target=depth_target[usable],
-            kernel=settings.robust_kernel,
-            huber_delta=settings.huber_delta,
-            group=settings.transform_group,
+            loss=loss,
+            group=group,
             max_start_error=max_start_error,
             seed=seed,
         )

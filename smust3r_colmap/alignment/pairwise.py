@@ -12,7 +12,7 @@ import logging
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -22,10 +22,10 @@ from smust3r_colmap.alignment.from_poses import align_poses
 from smust3r_colmap.alignment.from_tracks import align_matches, align_tracks, point_depths
 from smust3r_colmap.alignment.seen_points import SubmodelFit
 from smust3r_colmap.alignment.uncertainty import inflated_information, overlap_centre
-from smust3r_colmap.config import AlignmentConfig
 from smust3r_colmap.errors import DegenerateAlignmentError
-from smust3r_colmap.estimators.robust import evenly_chosen
-from smust3r_colmap.geometry.groups import GROUPS, embed
+from smust3r_colmap.estimators.confidence import ConfidenceWeighting
+from smust3r_colmap.estimators.robust import RobustKernel, RobustLoss, evenly_chosen
+from smust3r_colmap.geometry.groups import GROUPS, TransformGroup, embed
 from smust3r_colmap.geometry.so3 import angles_between
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import (
@@ -59,11 +59,39 @@ MAX_CAMERA_TURN_DEG = 10.0
 """Median difference in rotation of the shared cameras after the fit; sound edges have 0.1 to 1.8."""
 
 
+class AlignmentOptions(Protocol):
+    """How submodels are aligned, by the names of the settings of the stage."""
+
+    @property
+    def transform_group(self) -> TransformGroup:
+        """Of all edges."""
+
+    @property
+    def alignment_edges(self) -> Literal["both", "points", "poses"]:
+        """Kinds of edges."""
+
+    @property
+    def alignment_source(self) -> Literal["auto", "tracks", "pointmaps"]:
+        """Correspondences of the edges from points."""
+
+    @property
+    def confidence_weighting(self) -> ConfidenceWeighting:
+        """Of pointmaps."""
+
+    @property
+    def robust_kernel(self) -> RobustKernel:
+        """Of all fits."""
+
+    @property
+    def huber_delta(self) -> float:
+        """Of the huber kernel, in units of the target."""
+
+
 def align_submodels(
     submodels: Sequence[Submodel],
     dense: Sequence[DenseMaps],
     matches: InterSegmentMatches | None,
-    settings: AlignmentConfig,
+    options: AlignmentOptions,
     *,
     loop_segments: Collection[int] = (),
     seed: int,
@@ -78,12 +106,12 @@ def align_submodels(
     Args:
         submodels: all of the run. dense: their maps, in the same order.
         matches: verified matches, for submodels that share too few images; None where there are none.
-        settings: group, kinds of edges, source of correspondences, kernel, weighting.
+        options: group, kinds of edges, source of correspondences, loss, weighting.
         loop_segments: indices of the segments that are loops, not windows of the sequence.
         seed: of the searches for a robust start.
         advance: called with 1 after each pair of ``candidate_pairs``.
     """
-    aligner = _Aligner(submodels=submodels, dense=dense, matches=matches, settings=settings, seed=seed)
+    aligner = _Aligner(submodels=submodels, dense=dense, matches=matches, options=options, seed=seed)
     outcomes: list[SegmentAlignment | TriedAlignment] = []
     for target, source in candidate_pairs(submodels, loop_segments):
         outcomes += aligner.align(target, source)
@@ -94,10 +122,10 @@ def align_submodels(
     )
 
 
-def needs_maps(submodels: Sequence[Submodel], settings: AlignmentConfig) -> bool:
+def needs_maps(submodels: Sequence[Submodel], options: AlignmentOptions) -> bool:
     """Whether any pair may be aligned by its pointmaps."""
-    return settings.alignment_source == "pointmaps" or (
-        settings.alignment_source == "auto" and any(submodel.tracks is None for submodel in submodels)
+    return options.alignment_source == "pointmaps" or (
+        options.alignment_source == "auto" and any(submodel.tracks is None for submodel in submodels)
     )
 
 
@@ -122,31 +150,44 @@ class _Aligner:
     submodels: Sequence[Submodel]
     dense: Sequence[DenseMaps]
     matches: InterSegmentMatches | None
-    settings: AlignmentConfig
+    options: AlignmentOptions
     seed: int
     _depths: dict[int, float] = field(default_factory=dict)
+
+    @property
+    def _loss(self) -> RobustLoss:
+        return RobustLoss(kernel=self.options.robust_kernel, huber_delta=self.options.huber_delta)
 
     def align(self, target: int, source: int) -> list[SegmentAlignment | TriedAlignment]:
         """Every edge between two submodels that was tried."""
         outcomes: list[SegmentAlignment | TriedAlignment] = []
         shared = bool(set(self.submodels[target].images) & set(self.submodels[source].images))
-        if self.settings.alignment_edges != "poses":
+        if self.options.alignment_edges != "poses":
             if shared:
                 outcomes.append(self._by_points(target, source))
             if not any(_is_accepted(one) for one in outcomes) and self._has_matches(target, source):
                 outcomes.append(self._by_matches(target, source))
-        if shared and self.settings.alignment_edges != "points":
+        if shared and self.options.alignment_edges != "points":
             outcomes.append(self._by_poses(target, source, beside=tuple(outcomes)))
         return outcomes
 
     def _by_points(self, target: int, source: int) -> SegmentAlignment | TriedAlignment:
         a, b = self.submodels[target], self.submodels[source]
-        evidence = _evidence(a, b, self.settings)
+        evidence = _evidence(a, b, self.options)
         try:
             if evidence == "tracks":
-                fit = align_tracks(a, b, self.settings, seed=self.seed)
+                fit = align_tracks(a, b, loss=self._loss, group=self.options.transform_group, seed=self.seed)
             else:
-                fit = align_pointmaps(a, b, self.dense[target], self.dense[source], self.settings, seed=self.seed)
+                fit = align_pointmaps(
+                    a,
+                    b,
+                    self.dense[target],
+                    self.dense[source],
+                    loss=self._loss,
+                    group=self.options.transform_group,
+                    weighting=self.options.confidence_weighting,
+                    seed=self.seed,
+                )
             return self._edge(target, source, fit, evidence, _rejection(a, b, fit))
         except DegenerateAlignmentError as error:
             return TriedAlignment(target=target, source=source, evidence=evidence, reason=str(error))
@@ -159,7 +200,7 @@ class _Aligner:
         assert self.matches is not None
         a, b = self.submodels[target], self.submodels[source]
         try:
-            fit = _align_by_matches(a, b, self.matches, self.settings, self.seed)
+            fit = _align_by_matches(a, b, self.matches, self._loss, self.options.transform_group, self.seed)
         except DegenerateAlignmentError as error:
             return TriedAlignment(target=target, source=source, evidence="matches", reason=str(error))
         return self._edge(target, source, fit, "matches", _rejection_of_matches(a, b, fit))
@@ -168,9 +209,9 @@ class _Aligner:
         self, target: int, source: int, *, beside: Sequence[SegmentAlignment | TriedAlignment]
     ) -> SegmentAlignment | TriedAlignment:
         a, b = self.submodels[target], self.submodels[source]
-        group: Literal["sim3", "se3"] = "se3" if self.settings.transform_group == "se3" else "sim3"
+        group: Literal["sim3", "se3"] = "se3" if self.options.transform_group == "se3" else "sim3"
         try:
-            fit = align_poses(a, b, depth_target=self._depth(target), kernel=self.settings.robust_kernel, group=group)
+            fit = align_poses(a, b, depth_target=self._depth(target), kernel=self.options.robust_kernel, group=group)
             edge = self._edge(target, source, fit, "poses", _rejection_of_poses(a, b, fit))
         except DegenerateAlignmentError as error:
             return TriedAlignment(target=target, source=source, evidence="poses", reason=str(error))
@@ -180,7 +221,7 @@ class _Aligner:
         """The fit with inflated covariance, in the group of the run."""
         b = self.submodels[source]
         shared = set(self.submodels[target].images) & set(b.images)
-        group = GROUPS[self.settings.transform_group]
+        group = GROUPS[self.options.transform_group]
         information = inflated_information(
             fit.estimate,
             num_images=max(len(shared), 1),
@@ -244,14 +285,14 @@ def _is_accepted(outcome: SegmentAlignment | TriedAlignment) -> bool:
     return isinstance(outcome, SegmentAlignment) and outcome.accepted
 
 
-def _evidence(a: Submodel, b: Submodel, settings: AlignmentConfig) -> str:
-    if settings.alignment_source != "auto":
-        return settings.alignment_source
+def _evidence(a: Submodel, b: Submodel, options: AlignmentOptions) -> str:
+    if options.alignment_source != "auto":
+        return options.alignment_source
     return "tracks" if a.tracks is not None and b.tracks is not None else "pointmaps"
 
 
 def _align_by_matches(
-    a: Submodel, b: Submodel, matches: InterSegmentMatches, settings: AlignmentConfig, seed: int
+    a: Submodel, b: Submodel, matches: InterSegmentMatches, loss: RobustLoss, group: TransformGroup, seed: int
 ) -> SubmodelFit:
     """Matches run from the lower to the higher image; take them both ways."""
     in_a, in_b = np.array(a.images), np.array(b.images)
@@ -264,11 +305,12 @@ def _align_by_matches(
     return align_matches(
         a,
         b,
-        settings,
         image_a=both(matches.image_a, matches.image_b),
         feature_a=both(matches.feature_a, matches.feature_b),
         image_b=both(matches.image_b, matches.image_a),
         feature_b=both(matches.feature_b, matches.feature_a),
+        loss=loss,
+        group=group,
         seed=seed,
     )
 

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from smust3r_colmap.config import RobustKernel, TransformGroup
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.estimators.affine3 import estimate_affine3
-from smust3r_colmap.estimators.robust import evenly_chosen
+from smust3r_colmap.estimators.robust import CAUCHY, RobustLoss, evenly_chosen
 from smust3r_colmap.estimators.sim3 import consensus_sim3, estimate_sim3, homogeneous, point_distances
 from smust3r_colmap.estimators.sl4 import estimate_sl4
 from smust3r_colmap.geometry.arrays import FloatArray
+from smust3r_colmap.geometry.groups import TransformGroup
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import TransformEstimate
@@ -52,21 +52,20 @@ class _SeenPoints:
 
     Args:
         source, target: (N, 3). weights: (N,). depth: (N,) in units of the target.
-        kernel, huber_delta, seed: as there.
+        loss, seed: as there.
     """
 
     source: FloatArray
     target: FloatArray
     weights: FloatArray
     depth: FloatArray
-    kernel: RobustKernel
-    huber_delta: float
+    loss: RobustLoss
     seed: int
 
     @property
     def residual_scale(self) -> FloatArray | None:
-        """The depth for kernels that have no unit; Huber's is one of length."""
-        return None if self.kernel == "huber" else self.depth
+        """The depth, except for Huber's loss, whose constant is a length."""
+        return self.depth if self.loss.redescends else None
 
     def inliers(self, estimate: TransformEstimate) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Source (M, 3), target (M, 3) and squared-residual weights (M,) of the rows that fit."""
@@ -81,25 +80,22 @@ class _SeenPoints:
         if group == "affine3":
             return estimate_affine3(
                 *arguments,
-                kernel=self.kernel,
-                huber_delta=self.huber_delta,
+                loss=self.loss,
                 residual_scale=self.residual_scale,
                 start=start,
             )
         if group == "sl4":
             return estimate_sl4(
                 *arguments,
-                max_error=CONSENSUS_RELATIVE_ERROR * (float(np.median(self.depth)) if self.kernel == "huber" else 1.0),
+                max_error=CONSENSUS_RELATIVE_ERROR * (1.0 if self.loss.redescends else float(np.median(self.depth))),
                 seed=self.seed,
-                kernel=self.kernel,
-                huber_delta=self.huber_delta,
+                loss=self.loss,
                 residual_scale=self.residual_scale,
                 start=start,
             )
         return estimate_sim3(
             *arguments,
-            kernel=self.kernel,
-            huber_delta=self.huber_delta,
+            loss=self.loss,
             residual_scale=self.residual_scale,
             fixed_scale=group == "se3",
             start=start,
@@ -113,8 +109,7 @@ def align_seen_points(
     *,
     depth_source: FloatArray,
     depth_target: FloatArray,
-    kernel: RobustKernel,
-    huber_delta: float,
+    loss: RobustLoss = CAUCHY,
     group: TransformGroup = "sim3",
     max_start_error: float = np.inf,
     seed: int = 0,
@@ -134,7 +129,7 @@ def align_seen_points(
         points_source, points_target: (N, 3); equal rows are the same scene point.
         weights: (N,) non-negative.
         depth_source, depth_target: (N,) each in units of its own frame.
-        kernel, huber_delta: as for `estimate_sim3`.
+        loss: as for `estimate_sim3`.
         group: of the transform.
         max_start_error: pairs further apart at the consensus, divided by the depth, are left out.
         seed: of the consensus, and of the samples of ``sl4``.
@@ -154,7 +149,7 @@ def align_seen_points(
     unit = np.median(depth_target[usable] / depth_source[usable])
     depth = np.sqrt(depth_target[usable] * depth_source[usable] * unit)
     start, start_weights = None, weights[usable]
-    if kernel != "huber":
+    if loss.redescends:
         start = consensus_sim3(*points, max_error=CONSENSUS_RELATIVE_ERROR * float(np.median(depth)), seed=seed)
         start_weights = start_weights * (point_distances(start, *points) <= max_start_error * depth)
     seen = _SeenPoints(
@@ -162,8 +157,7 @@ def align_seen_points(
         target=points[1],
         weights=start_weights,
         depth=depth,
-        kernel=kernel,
-        huber_delta=huber_delta,
+        loss=loss,
         seed=seed,
     )
     estimate, fallback = _estimate_or_fall_back(seen, group, start)

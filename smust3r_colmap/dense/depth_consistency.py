@@ -23,7 +23,7 @@ import pycolmap
 from scipy import sparse
 
 from smust3r_colmap.errors import InputError
-from smust3r_colmap.estimators.weighted_median import weighted_median
+from smust3r_colmap.estimators.robust import weighted_median
 from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.products import DepthMaps

@@ -1,17 +1,18 @@
-"""Robust Affine(3) between matched points: the closed form that ``irls`` iterates (paper section III-D).
+"""Robust Affine(3) between matched points: the closed form that ``sim3`` iterates (paper section III-D).
 
 A similarity with stretch and shear has twelve parameters and needs points in all three dimensions;
-what becomes of a wall is decided in ``seen_points``. The next module to read is ``projective``.
+what becomes of a wall is decided in ``seen_points``. The next module to read is ``sl4``.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.config import RobustKernel
 from smust3r_colmap.errors import DegenerateAlignmentError
-from smust3r_colmap.estimators.robust import Loss
+from smust3r_colmap.estimators.robust import CAUCHY, RobustLoss
 from smust3r_colmap.estimators.sim3 import Pairs, affine_matrix, fit_robustly, usable_pairs
 from smust3r_colmap.geometry.affine3 import Affine3
 from smust3r_colmap.geometry.arrays import FloatArray
@@ -27,8 +28,7 @@ def estimate_affine3(
     points_b: npt.ArrayLike,
     weights: npt.ArrayLike,
     *,
-    kernel: RobustKernel = "cauchy",
-    huber_delta: float = 0.1,
+    loss: RobustLoss = CAUCHY,
     max_iterations: int | None = None,
     residual_scale: npt.ArrayLike | None = None,
     start: Transform | None = None,
@@ -41,7 +41,7 @@ def estimate_affine3(
     in the scale of `estimate_sim3`.
 
     Args:
-        points_a, points_b, weights, kernel, huber_delta, max_iterations, residual_scale, start: as
+        points_a, points_b, weights, loss, max_iterations, residual_scale, start: as
             for `estimate_sim3`.
 
     Returns:
@@ -57,13 +57,13 @@ def estimate_affine3(
         _symmetric_fit(pairs, np.ones(len(pairs.weights)), np.eye(4)) if start is None else pairs.centred(start.matrix),
         _symmetric_fit,
         group=Affine3,
-        loss=Loss(kernel=kernel, huber_delta=huber_delta, squared=True),
+        loss=replace(loss, squared=True),
         max_iterations=max_iterations,
     )
 
 
 def _symmetric_fit(pairs: Pairs, kernel_weights: FloatArray, before: FloatArray) -> FloatArray:
-    """Total least squares by moments, as `irls.Refit`.
+    """Total least squares by moments, as `sim3.Refit`.
 
     With S_a, S_b the second moments about the means and C = sum of w a b^T, the linear part A fulfils
     A S_a A^T = S_b and makes A C symmetric: nine equations that are the same for the inverse, and

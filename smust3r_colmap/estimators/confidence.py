@@ -7,18 +7,20 @@ the corrected confidences as weights.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.config import ConfidenceWeighting
+from smust3r_colmap.estimators.robust import trimmed_median
 from smust3r_colmap.geometry.arrays import FloatArray
+
+ConfidenceWeighting = Literal["relative", "paper", "off"]
 
 HALF_CONFIDENCE_DISAGREEMENT = 0.05
 """Depth difference over depth at which half of the confidence is left, in relative mode: sound overlaps
 have median disagreements up to 0.046, broken ones from 0.15 (six real image sets). The 1 of the
 paper's formula is 1 m, at depths of 2 to 4 m indoors a disagreement of 0.25 to 0.5."""
-TRIMMING_ROUNDS = 3
-"""Of the common scale of both maps."""
 
 
 def reweighted(
@@ -74,21 +76,6 @@ def _relative_difference(c_i: FloatArray, c_j: FloatArray, d_i: FloatArray, d_j:
     """(N,) depth difference over mean depth, both at the scale on which most confident pixels agree."""
     confident = (c_i > 1) & (c_j > 1)
     log_ratio = np.log(d_i / d_j)
-    i_from_j = np.exp(_main_value(log_ratio[confident] if confident.any() else log_ratio))
+    i_from_j = np.exp(trimmed_median(log_ratio[confident] if confident.any() else log_ratio))
     difference: FloatArray = np.abs(d_i - i_from_j * d_j) / (0.5 * (d_i + i_from_j * d_j))
     return difference
-
-
-def _main_value(values: FloatArray) -> float:
-    """Median of the values within three standard deviations (1.4826 MAD) of it; 0 where there are none.
-
-    The plain median leans towards one-sided outliers, by half a standard deviation for 30 % of them.
-    """
-    if len(values) == 0:
-        return 0.0
-    near = values
-    for _ in range(TRIMMING_ROUNDS):
-        centre = float(np.median(near))
-        sigma = 1.4826 * float(np.median(np.abs(near - centre)))
-        near = values[np.abs(values - centre) <= 3 * sigma]
-    return centre

@@ -1,8 +1,8 @@
 """Robust transforms between matched points by iteratively reweighted least squares (paper eq. 2).
 
 A fit, residuals, new weights, again: `fit_robustly` is the iteration for every group of transforms,
-and a `Refit` is the part that differs. This module has the one of Sim(3) and SE(3), ``affine`` that
-of Affine(3), ``projective`` that of SL(4). Everything is computed in float64 about the centre of the
+and a `Refit` is the part that differs. This module has the one of Sim(3) and SE(3), ``affine3`` that
+of Affine(3), ``sl4`` that of SL(4). Everything is computed in float64 about the centre of the
 data, and the default kernels take their scale from the residuals, so neither the unit of the scene
 nor its place matters. The next module to read is ``seen_points``, which chooses among the groups.
 """
@@ -17,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from smust3r_colmap.config import RobustKernel
 from smust3r_colmap.errors import DegenerateAlignmentError
-from smust3r_colmap.estimators.robust import MAD_TO_SIGMA, TRIMMING_ROUNDS, Loss, evenly_chosen
+from smust3r_colmap.estimators.robust import CAUCHY, RobustLoss, evenly_chosen, robust_scale
+from smust3r_colmap.estimators.similarity import CentredPairs
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3
@@ -52,8 +52,7 @@ def estimate_sim3(
     points_b: npt.ArrayLike,
     weights: npt.ArrayLike,
     *,
-    kernel: RobustKernel = "cauchy",
-    huber_delta: float = 0.1,
+    loss: RobustLoss = CAUCHY,
     max_iterations: int | None = None,
     residual_scale: npt.ArrayLike | None = None,
     fixed_scale: bool = False,
@@ -74,8 +73,7 @@ def estimate_sim3(
     Args:
         points_a, points_b: (N, 3); equal rows are the same scene point.
         weights: (N,) non-negative, of any common unit; rows of weight zero have no influence.
-        kernel: ``"cauchy"``, ``"tukey"`` or ``"huber"``.
-        huber_delta: residual where Huber's loss turns linear, in units of b (after the division).
+        loss: of the divided residuals.
         max_iterations: of each kernel; None means 5 for huber and 100 otherwise.
         residual_scale: (N,) positive; residuals are divided by it (such as the depth). None: ones.
         fixed_scale: keep the scale at 1: the estimate and its information are of SE(3).
@@ -93,14 +91,14 @@ def estimate_sim3(
     Source: Horn 1987 (closed form, symmetric scale); Holland and Welsch 1977 (IRLS).
     """
     pairs = usable_pairs(points_a, points_b, weights, residual_scale, needed=3)
-    refit = _SimilarityRefit(fixed_scale=fixed_scale, squares_in_scale=kernel != "huber")
+    refit = _SimilarityRefit(fixed_scale=fixed_scale, squares_in_scale=loss.redescends)
     equal = np.ones(len(pairs.weights))
     return fit_robustly(
         pairs,
         refit(pairs, equal, np.eye(4)) if start is None else pairs.centred(start.matrix),
         refit,
         group=SE3 if fixed_scale else Sim3,
-        loss=Loss(kernel=kernel, huber_delta=huber_delta),
+        loss=loss,
         max_iterations=max_iterations,
     )
 
@@ -148,21 +146,12 @@ class Pairs:
     def sigma(self, residuals: FloatArray) -> float:
         """Robust standard deviation of the residuals, at least the floor of the data.
 
-        The median of all residuals, inflated by wrong pairs, would let them pull, move the fit and
-        so inflate it further; a median of those within three standard deviations is not moved.
-
         Raises:
             DegenerateAlignmentError: most residuals are infinite.
         """
-        order = np.argsort(residuals)
-        rising, mass = residuals[order], np.cumsum(self.weights[order])
-        num_near = len(rising)
-        for _ in range(TRIMMING_ROUNDS):
-            median = float(rising[np.searchsorted(mass, 0.5 * mass[num_near - 1])])
-            if not np.isfinite(median):
-                raise DegenerateAlignmentError(f"the fit sends most of {len(rising)} points to infinity or beyond")
-            sigma = max(MAD_TO_SIGMA * median, self.floor)
-            num_near = int(np.searchsorted(rising, 3 * sigma, side="right"))
+        sigma = robust_scale(residuals, self.weights, floor=self.floor)
+        if not np.isfinite(sigma):
+            raise DegenerateAlignmentError(f"the fit sends most of {len(residuals)} points to infinity or beyond")
         return sigma
 
     @property
@@ -271,7 +260,7 @@ def fit_robustly(
     refit: Refit,
     *,
     group: type[Transform],
-    loss: Loss,
+    loss: RobustLoss,
     max_iterations: int | None,
 ) -> TransformEstimate:
     """Iterate ``refit`` under the weights of ``loss``, and collect the evidence.
@@ -287,7 +276,7 @@ def fit_robustly(
         ValueError: ``max_iterations`` is not positive.
     """
     if max_iterations is None:
-        max_iterations = HUBER_ITERATIONS if loss.kernel == "huber" else REDESCENDING_ITERATIONS
+        max_iterations = REDESCENDING_ITERATIONS if loss.redescends else HUBER_ITERATIONS
     if max_iterations < 1:
         raise ValueError(f"max_iterations {max_iterations} must be at least 1")
     fit, iterations = start, 0
@@ -310,7 +299,7 @@ def fit_robustly(
 
 
 def _reweighted_fits(
-    pairs: Pairs, fit: FloatArray, refit: Refit, loss: Loss, *, max_iterations: int
+    pairs: Pairs, fit: FloatArray, refit: Refit, loss: RobustLoss, *, max_iterations: int
 ) -> tuple[FloatArray, int, str]:
     """Fit again with the kernel's weights until the points rest: fit, iterations, why it stopped."""
     for iteration in range(1, max_iterations + 1):
@@ -384,15 +373,12 @@ class _SimilarityRefit:
         precision = pairs.precision
         share = precision * kernel_weights
         share = share / share.sum()
-        mean_a, mean_b = share @ pairs.points_a, share @ pairs.points_b
-        a, b = pairs.points_a - mean_a, pairs.points_b - mean_b
-        _check_spread(a, share, "first")
-        _check_spread(b, share, "second")
-        linear = nearest_rotation((share[:, None] * b).T @ a)
-        if not self.fixed_scale:
-            in_scale = precision * kernel_weights ** (2 if self.squares_in_scale else 1)
-            linear *= np.sqrt(in_scale @ (b**2).sum(axis=1)) / np.sqrt(in_scale @ (a**2).sum(axis=1))
-        return affine_matrix(linear, mean_b - linear @ mean_a)
+        centred = CentredPairs.of(pairs.points_a, pairs.points_b, share)
+        _check_spread(centred.a, share, "first")
+        _check_spread(centred.b, share, "second")
+        rotation = nearest_rotation(centred.correlation(share))
+        in_scale = precision * kernel_weights ** (2 if self.squares_in_scale else 1)
+        return centred.similarity(rotation, 1.0 if self.fixed_scale else centred.symmetric_scale(in_scale)).matrix
 
 
 def affine_matrix(linear: FloatArray, translation: FloatArray) -> FloatArray:

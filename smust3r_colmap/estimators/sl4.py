@@ -1,22 +1,21 @@
 """Robust SL(4) between matched points: RANSAC on a normalised DLT, then reweighted Gauss-Newton steps.
 
 A projective transform of space has fifteen parameters and can bend almost anything into anything,
-so most of this module is about what not to believe: samples in a plane, samples turned inside out,
-the error of five noisy points, the bias of the algebraic error. What becomes of an overlap that does
+so most of this module tests for degeneracy: samples in a plane, samples turned inside out, the error
+of five noisy points, the bias of the algebraic error. What becomes of an overlap that does
 not determine it is decided in ``seen_points``, the next module to read.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.config import RobustKernel
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.estimators.affine3 import refuse_plane
-from smust3r_colmap.estimators.robust import Loss, evenly_chosen
+from smust3r_colmap.estimators.robust import CAUCHY, RobustLoss, evenly_chosen
 from smust3r_colmap.estimators.sim3 import (
     CONSENSUS_SAMPLE,
     Pairs,
@@ -69,8 +68,7 @@ def estimate_sl4(
     *,
     max_error: float,
     seed: int = 0,
-    kernel: RobustKernel = "cauchy",
-    huber_delta: float = 0.1,
+    loss: RobustLoss = CAUCHY,
     max_iterations: int | None = None,
     residual_scale: npt.ArrayLike | None = None,
     start: Transform | None = None,
@@ -79,7 +77,7 @@ def estimate_sl4(
 
     RANSAC finds a start: normalised DLT on five points, scored on 2,000 by the transfer error, the
     best fitted again to their inliers with rows weighted so that the algebraic error is the transfer
-    error. The iteration of ``irls`` then takes Gauss-Newton steps of the transfer error itself.
+    error. The iteration of ``sim3`` then takes Gauss-Newton steps of the transfer error itself.
 
     The determinant is positive by construction: a sample passes only if each of its five tetrahedra
     keeps its orientation, which makes the determinant of its transform positive and puts all five in
@@ -87,15 +85,15 @@ def estimate_sl4(
     Gauss-Newton steps multiply by exponentials of trace-free matrices, whose determinant is 1.
 
     Args:
-        points_a, points_b, weights, kernel, huber_delta, max_iterations, residual_scale: as for
-            `irls.estimate_sim3`. At most `MAX_PAIRS` usable rows are taken, evenly, so that time and
+        points_a, points_b, weights, loss, max_iterations, residual_scale: as for
+            `sim3.estimate_sim3`. At most `MAX_PAIRS` usable rows are taken, evenly, so that time and
             memory do not grow with their number.
         max_error: divided residual up to which a pair agrees in the RANSAC.
         seed: of the samples; the same seed gives the same result.
         start: one more hypothesis, such as a similarity.
 
     Returns:
-        As for `irls.estimate_sim3`; ``num_points`` counts the rows taken and ``information`` is (15, 15).
+        As for `sim3.estimate_sim3`; ``num_points`` counts the rows taken and ``information`` is (15, 15).
 
     Raises:
         DegenerateAlignmentError: fewer than 8 usable rows, no transform on which 8 agree (as when all
@@ -114,17 +112,17 @@ def estimate_sl4(
         _consensus(pairs, max_error, hypothesis, np.random.default_rng(seed)),
         _gauss_newton_step,
         group=SL4,
-        loss=Loss(kernel=kernel, huber_delta=huber_delta, squared=True),
+        loss=replace(loss, squared=True),
         max_iterations=max_iterations,
     )
 
 
 def _gauss_newton_step(pairs: Pairs, kernel_weights: FloatArray, before: FloatArray) -> FloatArray:
-    """One step of the transfer error, as `irls.Refit`, on the right perturbation of SL(4).
+    """One step of the transfer error, as `sim3.Refit`, on the right perturbation of SL(4).
 
     The Jacobian is taken midway between a and the pre-image of b. At a it would follow the noise of a
     and pull the transform towards a smaller one; midway the normal equations are those of the
-    inverse, and for an affine transform those of ``affine``.
+    inverse, and for an affine transform those of ``affine3``.
     """
     pre_image = transformed(_inverse(before), pairs.points_b)
     used = (kernel_weights > 0) & np.isfinite(pre_image).all(axis=1)

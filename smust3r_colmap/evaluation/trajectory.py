@@ -17,12 +17,12 @@ from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.errors import DegenerateAlignmentError
-from smust3r_colmap.estimators.similarity import fit_similarity, transposed
+from smust3r_colmap.estimators.similarity import fit_camera_similarity
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import Sim3
+from smust3r_colmap.geometry.so3 import angles_between
 
 Trajectory = Mapping[str, FloatArray]
 
@@ -94,10 +94,10 @@ def compare_trajectories(
         )
     estimated = _stacked(world_from_cam_estimated, names, "estimate")
     reference = _stacked(world_from_cam_reference, names, "reference")
-    reference_from_estimated, alignment = fit_similarity(estimated, reference)
+    reference_from_estimated, alignment = fit_camera_similarity(estimated, reference)
     moved = reference_from_estimated.move_cameras(estimated)
     distances = np.linalg.norm(moved[:, :, 3] - reference[:, :, 3], axis=1)
-    angles_deg = np.rad2deg(Rotation.from_matrix(transposed(reference[:, :, :3]) @ moved[:, :, :3]).magnitude())
+    angles_deg = np.rad2deg(angles_between(reference[:, :, :3], moved[:, :, :3]))
     return Evaluation(
         reference_from_estimated=reference_from_estimated,
         alignment=alignment,

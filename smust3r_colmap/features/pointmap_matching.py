@@ -23,6 +23,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial import cKDTree
 
+from smust3r_colmap.estimators.robust import MAD_TO_SIGMA
 from smust3r_colmap.features.correspondences import Correspondences
 from smust3r_colmap.features.patch_alignment import (
     MAX_STRETCH,
@@ -186,7 +187,7 @@ class _View:
 def _usual(sizes: FloatArray, least: float, most: float) -> BoolArray:
     """(K,) which of the sizes of errors (K,) are within ``SIGMAS`` robust standard deviations, bounded both ways."""
     finite = sizes[np.isfinite(sizes)]
-    sigma = 1.4826 * np.median(finite) if len(finite) else 0.0
+    sigma = MAD_TO_SIGMA * np.median(finite) if len(finite) else 0.0
     return np.asarray(sizes <= np.clip(SIGMAS * sigma, least, most))
 
 

@@ -6,6 +6,8 @@ its tangent vectors. The next module to read is ``camera``.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
 from smust3r_colmap.geometry.affine3 import Affine3
@@ -14,6 +16,8 @@ from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.sl4 import SL4
 from smust3r_colmap.geometry.transform import Transform
+
+TransformGroup = Literal["sim3", "se3", "affine3", "sl4"]
 
 GROUPS: dict[str, type[Transform]] = {"sim3": Sim3, "se3": SE3, "affine3": Affine3, "sl4": SL4}
 """Every value of the setting ``transform_group``."""

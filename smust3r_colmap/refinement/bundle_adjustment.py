@@ -15,6 +15,7 @@ import numpy as np
 import pycolmap
 from scipy.sparse import csr_array
 
+from smust3r_colmap.estimators.similarity import CentredPairs
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.geometry.so3 import nearest_rotation
@@ -277,10 +278,10 @@ def _turn_back(model: pycolmap.Reconstruction, before: FloatArray) -> None:
     if not np.isfinite(after).all():
         return
     old, new = invert_rigid(before)[:, :, 3], invert_rigid(after)[:, :, 3]
-    middle, extent = new.mean(axis=0), extent_of(old)
-    covariance = (new - middle).T @ (old - old.mean(axis=0)) / extent**2
-    covariance += np.einsum("nki,nkj->ij", after[:, :, :3], before[:, :, :3])
-    old_from_new = nearest_rotation(covariance.T)
+    centres = CentredPairs.of(new, old)
+    by_axes = np.einsum("nki,nkj->ij", before[:, :, :3], after[:, :, :3])
+    old_from_new = nearest_rotation(centres.correlation() / extent_of(old) ** 2 + by_axes)
+    middle = centres.mean_a
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(old_from_new), middle - old_from_new @ middle))
 
 

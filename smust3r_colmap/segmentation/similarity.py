@@ -37,6 +37,7 @@ import numpy as np
 import numpy.typing as npt
 
 from smust3r_colmap.errors import InputError
+from smust3r_colmap.estimators.robust import mad_sigma
 from smust3r_colmap.geometry.arrays import IntArray
 
 Descriptors = npt.NDArray[np.float32]
@@ -125,7 +126,7 @@ def similarity_statistics(descriptors: Descriptors) -> SimilarityStatistics | No
     median = float(np.median(far))
     return SimilarityStatistics(
         far_median=median,
-        far_sigma=max(1.4826 * float(np.median(np.abs(far - median))), _MIN_SIGMA),
+        far_sigma=max(mad_sigma(far), _MIN_SIGMA),
         neighbour_median=float(np.median(neighbours)),
     )
 

@@ -14,14 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from smust3r_colmap.config import LoopKernel
 from smust3r_colmap.geometry.so3 import angles_between
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import SegmentAlignment, Submodel
 from smust3r_colmap.segmentation.loop_segments import PlannedLoop
 from smust3r_colmap.stitching.loop_verification import LoopDecision, verify_loops
 from smust3r_colmap.stitching.pose_graph.graph import ODOMETRY, PoseGraph
-from smust3r_colmap.stitching.pose_graph.optimise import GraphSolution, optimise
+from smust3r_colmap.stitching.pose_graph.optimise import GraphSolution, Kernel, optimise
 from smust3r_colmap.stitching.spanning_tree import ChainedPart, chain_submodels
 
 
@@ -70,7 +69,7 @@ def stitch_submodels(
     loops: Sequence[PlannedLoop],
     *,
     group: type[Transform],
-    kernel: LoopKernel,
+    kernel: Kernel,
 ) -> Stitching:
     """Chain the windows, verify the loops, optimise the graph, remove the loops that it rejects.
 

@@ -12,8 +12,8 @@ from helpers.scenes import make_submodel, rotation_about_y, some_sim3, walk
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.alignment.from_poses import align_poses
-from smust3r_colmap.config import RobustKernel
 from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.estimators.robust import RobustKernel
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3

@@ -15,12 +15,13 @@ from scipy.spatial.transform import Rotation
 from smust3r_colmap.alignment.from_pointmaps import align_pointmaps
 from smust3r_colmap.alignment.from_tracks import align_matches, align_tracks, point_depths
 from smust3r_colmap.alignment.seen_points import SubmodelFit, align_seen_points
-from smust3r_colmap.config import AlignmentConfig, RobustKernel, TransformGroup
 from smust3r_colmap.errors import DegenerateAlignmentError, ReconstructionError
+from smust3r_colmap.estimators.confidence import ConfidenceWeighting
+from smust3r_colmap.estimators.robust import RobustKernel, RobustLoss
 from smust3r_colmap.estimators.sim3 import consensus_sim3, estimate_sim3
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
-from smust3r_colmap.geometry.groups import GROUPS
+from smust3r_colmap.geometry.groups import GROUPS, TransformGroup
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.transform import Transform
@@ -44,7 +45,9 @@ def sim3_of(estimate: TransformEstimate) -> Sim3:
 @pytest.mark.parametrize("count", [3, 4, 200])
 def test_exact_points_give_the_transform_to_rounding(kernel: RobustKernel, count: int) -> None:
     points_a = np.random.default_rng(0).normal(size=(count, 3))
-    estimate = estimate_sim3(points_a, SOURCE_FROM_TARGET.apply(points_a), np.ones(count), kernel=kernel)
+    estimate = estimate_sim3(
+        points_a, SOURCE_FROM_TARGET.apply(points_a), np.ones(count), loss=RobustLoss(kernel=kernel)
+    )
     assert_close(estimate.b_from_a, SOURCE_FROM_TARGET, 1e-12)
     assert estimate.stop_reason == "converged"
     assert estimate.num_inliers == estimate.num_points == count
@@ -58,7 +61,7 @@ def test_exact_points_with_outliers_give_the_transform_to_rounding(kernel: Robus
     points_a = rng.normal(size=(500, 3))
     points_b = SOURCE_FROM_TARGET.apply(points_a)
     points_b[:150] += rng.uniform(0.5, 2, (150, 3))
-    estimate = estimate_sim3(points_a, points_b, np.ones(500), kernel=kernel)
+    estimate = estimate_sim3(points_a, points_b, np.ones(500), loss=RobustLoss(kernel=kernel))
     assert_close(estimate.b_from_a, SOURCE_FROM_TARGET, 1e-9)
     assert estimate.num_inliers == 350
 
@@ -81,8 +84,7 @@ def align_room(data: Overlap, kernel: RobustKernel) -> Sim3:
         data.ones,
         depth_source=data.depth_source,
         depth_target=data.depth_target,
-        kernel=kernel,
-        huber_delta=0.1,
+        loss=RobustLoss(kernel=kernel),
     )
     return sim3_of(fit.estimate)
 
@@ -90,7 +92,7 @@ def align_room(data: Overlap, kernel: RobustKernel) -> Sim3:
 @pytest.mark.parametrize("kernel", REDESCENDING)
 def test_robust_start_survives_45_percent_where_the_plain_start_is_lost(kernel: RobustKernel) -> None:
     data = room_overlap(SOURCE_FROM_TARGET, count=10_000, outliers=0.45)
-    plain = estimate_sim3(data.points_source, data.points_target, data.ones, kernel=kernel)
+    plain = estimate_sim3(data.points_source, data.points_target, data.ones, loss=RobustLoss(kernel=kernel))
     assert data.map_cm(plain.b_from_a) > 20
     assert data.map_cm(align_room(data, kernel)) < 0.3
 
@@ -114,8 +116,10 @@ def test_unit_of_the_scene_does_not_matter(kernel: RobustKernel, unit: float) ->
 
 def test_unit_of_the_scene_does_matter_to_huber() -> None:
     data = room_overlap(SOURCE_FROM_TARGET, count=3000, outliers=0.3)
-    small = sim3_of(estimate_sim3(0.1 * data.points_source, 0.1 * data.points_target, data.ones, kernel="huber"))
-    metre = estimate_sim3(data.points_source, data.points_target, data.ones, kernel="huber").b_from_a
+    small = sim3_of(
+        estimate_sim3(0.1 * data.points_source, 0.1 * data.points_target, data.ones, loss=RobustLoss(kernel="huber"))
+    )
+    metre = estimate_sim3(data.points_source, data.points_target, data.ones, loss=RobustLoss(kernel="huber")).b_from_a
     assert data.map_cm(replace(small, translation=10 * small.translation)) > 3 * data.map_cm(metre)
 
 
@@ -164,14 +168,14 @@ def test_huber_parity_gives_the_value_found_by_hand() -> None:
     # s^2 = (4 * 0.24142 * 1 + 2 * 0.17071 * 4) / (4 * 0.24142 + 2 * 0.17071) = 2.33137 / 1.30711.
     points_a = np.vstack([np.eye(3), -np.eye(3)])
     points_b = points_a * [2.0, 1.0, 1.0]
-    once = estimate_sim3(points_a, points_b, np.ones(6), kernel="huber", huber_delta=0.1, max_iterations=1)
+    once = estimate_sim3(points_a, points_b, np.ones(6), loss=RobustLoss(kernel="huber"), max_iterations=1)
     assert float(sim3_of(once).scale) == pytest.approx(np.sqrt(2.33137 / 1.30711), rel=1e-5)
     assert (once.iterations, once.stop_reason) == (1, "iteration limit")
     scale_squared = 2.0
     for _ in range(5):
         near, far = 0.1 / (np.sqrt(scale_squared) - 1), 0.1 / (2 - np.sqrt(scale_squared))
         scale_squared = (4 * near + 8 * far) / (4 * near + 2 * far)
-    five = estimate_sim3(points_a, points_b, np.ones(6), kernel="huber")
+    five = estimate_sim3(points_a, points_b, np.ones(6), loss=RobustLoss(kernel="huber"))
     assert float(sim3_of(five).scale) == pytest.approx(np.sqrt(scale_squared), rel=1e-12)
     assert (five.iterations, five.stop_reason) == (5, "iteration limit")
 
@@ -247,7 +251,12 @@ def test_information_is_the_curvature_of_the_cost() -> None:
     weights, depth = rng.uniform(0.5, 2, 60), rng.uniform(1, 3, 60)
     points_b = SOURCE_FROM_TARGET.apply(points_a) + 1e-3 * depth[:, None] * rng.normal(size=(60, 3))
     estimate = estimate_sim3(
-        points_a, points_b, weights, kernel="huber", huber_delta=1.0, residual_scale=depth, max_iterations=1
+        points_a,
+        points_b,
+        weights,
+        loss=RobustLoss(kernel="huber", huber_delta=1.0),
+        residual_scale=depth,
+        max_iterations=1,
     )
 
     def residuals(delta: FloatArray) -> FloatArray:
@@ -268,7 +277,7 @@ def test_information_predicts_the_scatter_of_the_estimate(kernel: RobustKernel) 
     distances = []
     for _ in range(120):
         points_b = SOURCE_FROM_TARGET.apply(points_a) + rng.normal(scale=0.02, size=(150, 3))
-        estimate = estimate_sim3(points_a, points_b, np.ones(150), kernel=kernel)
+        estimate = estimate_sim3(points_a, points_b, np.ones(150), loss=RobustLoss(kernel=kernel))
         error = (estimate.b_from_a.inverse() @ SOURCE_FROM_TARGET).matrix
         delta = np.array(
             [
@@ -298,7 +307,7 @@ def test_points_that_leave_a_turn_free_are_refused(side: str, kernel: RobustKern
     ):
         a, b = (bad, POINTS) if side == "first" else (POINTS, bad)
         with pytest.raises(DegenerateAlignmentError, match=message):
-            estimate_sim3(a, b, np.ones(20), kernel=kernel)
+            estimate_sim3(a, b, np.ones(20), loss=RobustLoss(kernel=kernel))
 
 
 def test_too_few_usable_points_are_refused_with_their_numbers() -> None:
@@ -319,7 +328,6 @@ def test_too_few_usable_points_are_refused_with_their_numbers() -> None:
         ({"points_b": POINTS[:, :2]}, "do not fit"),
         ({"residual_scale": np.ones(3)}, "do not fit"),
         ({"weights": -np.ones(20)}, "20 weights are negative"),
-        ({"kernel": "huber", "huber_delta": 0.0}, "huber_delta"),
         ({"max_iterations": 0}, "max_iterations 0"),
     ],
 )
@@ -426,16 +434,16 @@ TARGET_FROM_SOURCE = SOURCE_FROM_TARGET.inverse()
 
 
 def test_pointmaps_without_noise_give_the_transform_to_single_precision() -> None:
-    fit = align_pointmaps(TARGET, SOURCE, *room_maps(noise=0, blobs=0), AlignmentConfig())
+    fit = align_pointmaps(TARGET, SOURCE, *room_maps(noise=0, blobs=0))
     assert_close(fit.estimate.b_from_a, TARGET_FROM_SOURCE, 1e-5)
     assert fit.relative_residual < 1e-6
 
 
 @pytest.mark.parametrize("weighting", ["relative", "paper", "off"])
 @pytest.mark.parametrize("kernel", REDESCENDING)
-def test_pointmaps_survive_30_percent_blobs(kernel: RobustKernel, weighting: str) -> None:
-    settings = AlignmentConfig(robust_kernel=kernel, confidence_weighting=weighting)  # type: ignore[arg-type]
-    fit = align_pointmaps(TARGET, SOURCE, *room_maps(noise=0.01, blobs=0.3), settings)
+def test_pointmaps_survive_30_percent_blobs(kernel: RobustKernel, weighting: ConfidenceWeighting) -> None:
+    maps = room_maps(noise=0.01, blobs=0.3)
+    fit = align_pointmaps(TARGET, SOURCE, *maps, loss=RobustLoss(kernel=kernel), weighting=weighting)
     exact = np.random.default_rng(0).uniform(0, 1, (500, 3)) * ROOM_M
     apart = fit.estimate.b_from_a.apply(SOURCE_FROM_TARGET.apply(exact)) - exact
     assert 1e-4 < np.linalg.norm(apart, axis=1).mean() < 2e-2
@@ -444,22 +452,22 @@ def test_pointmaps_survive_30_percent_blobs(kernel: RobustKernel, weighting: str
 
 
 @pytest.mark.parametrize("group", ["affine3", "sl4"])
-def test_pointmaps_of_one_wall_fall_back_from_the_group_of_the_settings(group: TransformGroup) -> None:
-    settings = AlignmentConfig(transform_group=group)  # the three shared images see one wall of the room
-    fit = align_pointmaps(TARGET, SOURCE, *room_maps(noise=0.01, blobs=0.3), settings, num_pixels=2000)
+def test_pointmaps_of_one_wall_fall_back_from_the_group(group: TransformGroup) -> None:
+    maps = room_maps(noise=0.01, blobs=0.3)  # the three shared images see one wall of the room
+    fit = align_pointmaps(TARGET, SOURCE, *maps, group=group, num_pixels=2000)
     assert type(fit.estimate.b_from_a) is Sim3
     assert "the common points are" in fit.fallback
 
 
-def test_pointmaps_are_aligned_rigidly_where_the_settings_say_so() -> None:
+def test_pointmaps_are_aligned_rigidly_in_se3() -> None:
     maps = room_maps(noise=0, blobs=0)
-    fit = align_pointmaps(TARGET, SOURCE, *maps, AlignmentConfig(transform_group="se3"), num_pixels=2000)
+    fit = align_pointmaps(TARGET, SOURCE, *maps, group="se3", num_pixels=2000)
     assert type(fit.estimate.b_from_a) is SE3
 
 
 def test_number_of_pixels_is_bounded_and_the_choice_repeats() -> None:
     maps = room_maps(noise=0.01, blobs=0.1)
-    first, second = (align_pointmaps(TARGET, SOURCE, *maps, AlignmentConfig(), num_pixels=500) for _ in range(2))
+    first, second = (align_pointmaps(TARGET, SOURCE, *maps, num_pixels=500) for _ in range(2))
     assert first.num_correspondences == 500
     np.testing.assert_array_equal(first.estimate.b_from_a.matrix, second.estimate.b_from_a.matrix)
 
@@ -478,8 +486,8 @@ def test_pixels_without_confidence_or_geometry_take_no_part(spoil: str) -> None:
         target_maps.depths[wrong] = 0.0
     else:
         target_maps.points[wrong] = np.nan
-    settings = AlignmentConfig(robust_kernel="huber")  # would be drawn by every wrong pixel
-    fit = align_pointmaps(TARGET, SOURCE, target_maps, source_maps, settings)
+    huber = RobustLoss(kernel="huber")  # would be drawn by every wrong pixel
+    fit = align_pointmaps(TARGET, SOURCE, target_maps, source_maps, loss=huber)
     assert_close(fit.estimate.b_from_a, TARGET_FROM_SOURCE, 1e-5)
     assert fit.num_correspondences == pytest.approx(3 * 48 * 38, rel=0.02)
 
@@ -488,7 +496,7 @@ def test_submodels_without_shared_images_are_refused() -> None:
     maps, _ = room_maps(noise=0, blobs=0)
     apart = submodel_of((10, 11, 12, 13, 14, 15), segment=7)
     with pytest.raises(DegenerateAlignmentError, match="submodels 0 and 7 share no image"):
-        align_pointmaps(TARGET, apart, maps, maps, AlignmentConfig())
+        align_pointmaps(TARGET, apart, maps, maps)
 
 
 def test_maps_without_confident_pixels_are_refused_by_name() -> None:
@@ -497,7 +505,7 @@ def test_maps_without_confident_pixels_are_refused_by_name() -> None:
     with pytest.raises(
         DegenerateAlignmentError, match="submodels 0 and 1, confident pixels of 3 images: 0 point pairs"
     ):
-        align_pointmaps(TARGET, SOURCE, target_maps, source_maps, AlignmentConfig())
+        align_pointmaps(TARGET, SOURCE, target_maps, source_maps)
 
 
 def test_maps_of_two_sizes_are_refused() -> None:
@@ -508,9 +516,9 @@ def test_maps_of_two_sizes_are_refused() -> None:
         confidences=source_maps.confidences[:, ::2, ::2],
     )
     with pytest.raises(ReconstructionError, match=r"image 3: the maps are \(48, 64\) in submodel 0 and \(24, 32\)"):
-        align_pointmaps(TARGET, SOURCE, target_maps, small, AlignmentConfig())
+        align_pointmaps(TARGET, SOURCE, target_maps, small)
     with pytest.raises(ValueError, match="submodel 1: 2 images, 6 dense maps"):
-        align_pointmaps(TARGET, submodel_of((3, 4), segment=1), target_maps, source_maps, AlignmentConfig())
+        align_pointmaps(TARGET, submodel_of((3, 4), segment=1), target_maps, source_maps)
 
 
 # --------------------------------------------------------------------------------- tracks
@@ -540,17 +548,17 @@ def track_submodel(
 def test_tracks_without_noise_give_the_transform_to_rounding() -> None:
     target = track_submodel((0, 1, 2), Sim3.identity(), segment=0)
     source = track_submodel((2, 3, 4), SOURCE_FROM_TARGET, segment=1)
-    fit = align_tracks(target, source, AlignmentConfig())
+    fit = align_tracks(target, source)
     assert_close(fit.estimate.b_from_a, TARGET_FROM_SOURCE, 1e-9)
     assert fit.num_correspondences == fit.estimate.num_inliers == NUM_POINTS
     assert fit.relative_residual < 1e-12
 
 
 @pytest.mark.parametrize("group", ["affine3", "sl4"])
-def test_tracks_are_aligned_in_the_group_of_the_settings(group: TransformGroup) -> None:
+def test_tracks_are_aligned_in_the_group(group: TransformGroup) -> None:
     target = track_submodel((0, 1, 2), Sim3.identity(), segment=0, noise=0.002)
     source = track_submodel((2, 3, 4), SOURCE_FROM_TARGET, segment=1, noise=0.002)
-    fit = align_tracks(target, source, AlignmentConfig(transform_group=group))
+    fit = align_tracks(target, source, group=group)
     assert type(fit.estimate.b_from_a) is GROUPS[group]
     assert fit.relative_residual < 0.004
 
@@ -559,7 +567,7 @@ def test_tracks_are_aligned_in_the_group_of_the_settings(group: TransformGroup) 
 def test_noisy_tracks_report_their_relative_residual(kernel: RobustKernel) -> None:
     target = track_submodel((0, 1, 2), Sim3.identity(), segment=0, noise=0.01)
     source = track_submodel((1, 2, 3), SOURCE_FROM_TARGET, segment=1, noise=0.01)
-    fit = align_tracks(target, source, AlignmentConfig(robust_kernel=kernel))
+    fit = align_tracks(target, source, loss=RobustLoss(kernel=kernel))
     assert float(sim3_of(fit.estimate).scale) == pytest.approx(1 / 1.7, rel=5e-3)
     # the median of |N(0, sqrt(2) %)|, over z-depths that are shorter than the rays
     assert 0.008 < fit.relative_residual < 0.013
@@ -580,8 +588,8 @@ def test_pair_of_points_counts_once_and_weighs_its_shared_observations() -> None
         image_of_observation=target.tracks.image_of_observation[kept],
         feature_of_observation=target.tracks.feature_of_observation[kept],
     )
-    settings = AlignmentConfig(robust_kernel="huber", huber_delta=1e3)  # least squares: a weighted mean
-    fit = align_tracks(replace(target, tracks=tracks), source, settings)
+    least_squares = RobustLoss(kernel="huber", huber_delta=1e3)  # a weighted mean
+    fit = align_tracks(replace(target, tracks=tracks), source, loss=least_squares)
     assert fit.num_correspondences == NUM_POINTS
     centre = source.tracks.points_seg.mean(axis=0) if source.tracks is not None else np.zeros(3)
     shift = (fit.estimate.b_from_a.apply(centre[None]) - centre)[0, 0]
@@ -591,10 +599,10 @@ def test_pair_of_points_counts_once_and_weighs_its_shared_observations() -> None
 def test_tracks_of_other_features_are_not_shared() -> None:
     target = track_submodel((0, 1, 2), Sim3.identity(), segment=0)
     with pytest.raises(DegenerateAlignmentError, match="submodels 0 and 1, shared track points: 0 point pairs; 3"):
-        align_tracks(target, track_submodel((3, 4), SOURCE_FROM_TARGET, segment=1), AlignmentConfig())
+        align_tracks(target, track_submodel((3, 4), SOURCE_FROM_TARGET, segment=1))
     other = track_submodel((0, 1, 2), SOURCE_FROM_TARGET, segment=1, feature_offset=NUM_POINTS + 7)
     with pytest.raises(DegenerateAlignmentError, match="0 point pairs"):
-        align_tracks(target, other, AlignmentConfig())
+        align_tracks(target, other)
 
 
 def test_depth_of_a_point_passes_over_cameras_that_it_is_behind() -> None:
@@ -615,10 +623,10 @@ def test_depth_of_a_point_passes_over_cameras_that_it_is_behind() -> None:
 def test_submodels_without_usable_tracks_are_refused() -> None:
     target = track_submodel((0, 1), Sim3.identity(), segment=0)
     with pytest.raises(ValueError, match="submodel 3 has no tracks"):
-        align_tracks(target, submodel_of((0, 1), segment=3), AlignmentConfig())
+        align_tracks(target, submodel_of((0, 1), segment=3))
     external = replace(track_submodel((0, 9), Sim3.identity(), segment=4), images=(0, 1))
     with pytest.raises(ValueError, match=r"submodel 4: tracks name images \[9\]"):
-        align_tracks(target, external, AlignmentConfig())
+        align_tracks(target, external)
 
 
 # -------------------------------------------------------------------------------- matches
@@ -636,16 +644,16 @@ def matches_between(wrong: float, *, seed: int = 0) -> InterSegmentMatches:
 
 
 def fit_to_matches(
-    target: Submodel, source: Submodel, matches: InterSegmentMatches, settings: AlignmentConfig
+    target: Submodel, source: Submodel, matches: InterSegmentMatches, kernel: RobustKernel = "cauchy"
 ) -> SubmodelFit:
     return align_matches(
         target,
         source,
-        settings,
         image_a=matches.image_a,
         feature_a=matches.feature_a,
         image_b=matches.image_b,
         feature_b=matches.feature_b,
+        loss=RobustLoss(kernel=kernel),
     )
 
 
@@ -654,8 +662,7 @@ def fit_to_matches(
 def test_align_matches_survives_wrong_matches(kernel: RobustKernel, wrong: float) -> None:
     target = track_submodel((0, 1, 2), Sim3.identity(), segment=0, noise=0.005)
     source = track_submodel((4, 5, 6), SOURCE_FROM_TARGET, segment=1, noise=0.005)
-    settings = AlignmentConfig(robust_kernel=kernel)
-    fit = fit_to_matches(target, source, matches_between(wrong), settings)
+    fit = fit_to_matches(target, source, matches_between(wrong), kernel)
     assert float(sim3_of(fit.estimate).scale) == pytest.approx(1 / 1.7, rel=4e-3)
     np.testing.assert_allclose(sim3_of(fit.estimate).rotation, TARGET_FROM_SOURCE.rotation, atol=5e-3)
     assert fit.num_correspondences == NUM_POINTS
@@ -666,7 +673,7 @@ def test_align_matches_survives_wrong_matches(kernel: RobustKernel, wrong: float
 def test_align_matches_without_noise_or_wrong_matches_is_exact() -> None:
     target = track_submodel((0, 1, 2), Sim3.identity(), segment=0)
     source = track_submodel((4, 5, 6), SOURCE_FROM_TARGET, segment=1)
-    fit = fit_to_matches(target, source, matches_between(0.0), AlignmentConfig())
+    fit = fit_to_matches(target, source, matches_between(0.0))
     assert_close(fit.estimate.b_from_a, TARGET_FROM_SOURCE, 1e-9)
 
 
@@ -676,14 +683,14 @@ def test_matches_of_no_point_are_ignored() -> None:
     matches = matches_between(0.0)
     matches.feature_a[:50] += 10_000
     matches.image_b[50:70] = 77
-    assert fit_to_matches(target, source, matches, AlignmentConfig()).num_correspondences == NUM_POINTS - 70
+    assert fit_to_matches(target, source, matches).num_correspondences == NUM_POINTS - 70
     matches.image_b[:] = 77
     with pytest.raises(DegenerateAlignmentError, match="submodels 0 and 1, matched points: 0 point pairs"):
-        fit_to_matches(target, source, matches, AlignmentConfig())
+        fit_to_matches(target, source, matches)
 
 
 def test_matches_of_different_length_are_refused() -> None:
     target = track_submodel((0, 1), Sim3.identity(), segment=0)
     row = np.zeros(5, dtype=np.int64)
     with pytest.raises(ValueError, match=r"needed \(M,\) each"):
-        align_matches(target, target, AlignmentConfig(), image_a=row, feature_a=row, image_b=row[:-1], feature_b=row)
+        align_matches(target, target, image_a=row, feature_a=row, image_b=row[:-1], feature_b=row)

@@ -7,8 +7,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from smust3r_colmap.config import ConfidenceWeighting
-from smust3r_colmap.estimators.confidence import reweighted
+from smust3r_colmap.estimators.confidence import ConfidenceWeighting, reweighted
 
 MODES: tuple[ConfidenceWeighting, ...] = get_args(ConfidenceWeighting)
 

@@ -13,14 +13,14 @@ from scipy.linalg import logm
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.alignment.seen_points import align_seen_points, implausibility
-from smust3r_colmap.config import RobustKernel, TransformGroup
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.estimators.affine3 import estimate_affine3
+from smust3r_colmap.estimators.robust import RobustKernel, RobustLoss
 from smust3r_colmap.estimators.sim3 import estimate_sim3, transformed
 from smust3r_colmap.estimators.sl4 import MAX_PAIRS, dlt, estimate_sl4
 from smust3r_colmap.geometry.affine3 import Affine3
 from smust3r_colmap.geometry.arrays import FloatArray
-from smust3r_colmap.geometry.groups import GROUPS
+from smust3r_colmap.geometry.groups import GROUPS, TransformGroup
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.sl4 import SL4
@@ -71,7 +71,7 @@ def corner_rotation_deg(error: SL4) -> float:
 @pytest.mark.parametrize(("group", "count"), [("affine3", 4), ("affine3", 200), ("sl4", 8), ("sl4", 200)])
 def test_exact_points_give_the_transform_to_rounding(group: BendingGroup, count: int, kernel: RobustKernel) -> None:
     points_a = np.random.default_rng(0).normal(size=(count, 3))
-    found = estimate(group, points_a, WARPS[group].apply(points_a), np.ones(count), kernel=kernel)
+    found = estimate(group, points_a, WARPS[group].apply(points_a), np.ones(count), loss=RobustLoss(kernel=kernel))
     assert type(found.b_from_a) is GROUPS[group]
     assert_close(found.b_from_a, WARPS[group], 1e-10)
     assert found.num_inliers == found.num_points == count
@@ -87,7 +87,7 @@ def test_exact_points_with_outliers_give_the_transform_to_rounding(group: Bendin
     points_a = rng.normal(size=(500, 3))
     points_b = WARPS[group].apply(points_a)
     points_b[:150] += rng.uniform(0.5, 2, (150, 3))
-    found = estimate(group, points_a, points_b, np.ones(500), kernel=kernel)
+    found = estimate(group, points_a, points_b, np.ones(500), loss=RobustLoss(kernel=kernel))
     assert_close(found.b_from_a, WARPS[group], 1e-8)
     assert found.num_inliers == 350
 
@@ -264,7 +264,8 @@ def test_information_is_the_curvature_of_the_cost(group: TransformGroup) -> None
     points_a = rng.normal(size=(60, 3)) * [3.0, 1.0, 0.5] + [4.0, -2.0, 1.0]
     weights, depth = rng.uniform(0.5, 2, 60), rng.uniform(1, 3, 60)
     points_b = WARPS[group].apply(points_a) + 1e-3 * depth[:, None] * rng.normal(size=(60, 3))
-    arguments: dict[str, Any] = {"kernel": "huber", "huber_delta": 1.0, "residual_scale": depth, "max_iterations": 3}
+    least_squares = RobustLoss(kernel="huber", huber_delta=1.0)
+    arguments: dict[str, Any] = {"loss": least_squares, "residual_scale": depth, "max_iterations": 3}
     if group == "se3":
         found = estimate_sim3(points_a, points_b, weights, fixed_scale=True, **arguments)
     else:
@@ -290,7 +291,7 @@ def test_information_predicts_the_scatter_of_the_estimate(group: BendingGroup, k
     distances = []
     for _ in range(40):
         points_b = WARPS[group].apply(points_a) + rng.normal(scale=0.02, size=(150, 3))
-        found = estimate(group, points_a, points_b, np.ones(150), kernel=kernel, start=WARPS[group])
+        found = estimate(group, points_a, points_b, np.ones(150), loss=RobustLoss(kernel=kernel), start=WARPS[group])
         error = (found.b_from_a.inverse() @ WARPS[group]).matrix
         delta = kind.vee(logm(error).real)
         distances.append(delta @ found.information @ delta)
@@ -341,8 +342,7 @@ def test_thickness_is_measured_against_the_noise(group: BendingGroup, thickness:
         np.ones(4000),
         depth_source=np.full(4000, 6.8),
         depth_target=np.full(4000, 4.0),
-        kernel="cauchy",
-        huber_delta=0.1,
+        loss=RobustLoss(),
         group=group,
     )
     assert bool(fit.fallback) == falls_back
@@ -421,7 +421,7 @@ def test_line_and_point_are_refused_in_every_group(group: TransformGroup) -> Non
             with pytest.raises(DegenerateAlignmentError, match=r"line|are one"):
                 align_seen_points(
                     bad, bad, np.ones(300), depth_source=depth, depth_target=depth,
-                    kernel=kernel, huber_delta=0.1, group=group,
+                    loss=RobustLoss(kernel=kernel), group=group,
                 )  # fmt: skip
 
 
@@ -465,7 +465,7 @@ def test_three_points_fall_back_to_sim3(group: BendingGroup) -> None:
     depth = points[:, 2]
     fit = align_seen_points(
         SIMILARITY.apply(points), points, np.ones(3), depth_source=1.7 * depth, depth_target=depth,
-        kernel="cauchy", huber_delta=0.1, group=group,
+        loss=RobustLoss(), group=group,
     )  # fmt: skip
     assert_close(fit.estimate.b_from_a, SIMILARITY.inverse(), 1e-9)
     assert "thick" in fit.fallback or "are needed" in fit.fallback
@@ -479,7 +479,7 @@ def test_arguments_that_make_no_sense_are_refused() -> None:
         with pytest.raises(ValueError, match="max_iterations 0"):
             estimate(group, points, points, np.ones(20), max_iterations=0)
         with pytest.raises(ValueError, match="huber_delta"):
-            estimate(group, points, points, np.ones(20), kernel="huber", huber_delta=0.0)
+            estimate(group, points, points, np.ones(20), loss=RobustLoss(kernel="huber", huber_delta=0.0))
         with pytest.raises(ValueError, match="20 weights are negative"):
             estimate(group, points, points, -np.ones(20))
         with pytest.raises(ValueError, match="do not fit"):

@@ -9,8 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.alignment.seen_points import SubmodelFit, align_seen_points
-from smust3r_colmap.config import RobustKernel, TransformGroup
+from smust3r_colmap.estimators.robust import RobustKernel, RobustLoss
 from smust3r_colmap.geometry.arrays import FloatArray
+from smust3r_colmap.geometry.groups import TransformGroup
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.transform import Transform
 
@@ -40,14 +41,13 @@ class Overlap:
         return 100 * float(np.linalg.norm(apart, axis=1).mean())
 
     def aligned(self, group: TransformGroup, kernel: RobustKernel = "cauchy", **changes: Any) -> SubmodelFit:
-        arguments = {
+        arguments: dict[str, Any] = {
             "points_source": self.points_source,
             "points_target": self.points_target,
             "weights": self.ones,
             "depth_source": self.depth_source,
             "depth_target": self.depth_target,
-            "kernel": kernel,
-            "huber_delta": 0.1,
+            "loss": RobustLoss(kernel=kernel),
             "group": group,
         }
         return align_seen_points(**(arguments | changes))

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from smust3r_colmap.alignment.from_pointmaps import align_pointmaps
 from smust3r_colmap.alignment.seen_points import SubmodelFit
 from smust3r_colmap.backbones.base import Backbone
-from smust3r_colmap.config import AlignmentConfig
 from smust3r_colmap.errors import CollectionError, ConfigError, DegenerateAlignmentError, ImageError, InputError
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres, pointmap_from_depth
@@ -60,7 +59,7 @@ def submodels_of(backbone: OracleBackbone, segments: Sequence[Segment]) -> tuple
 
 
 def aligned(target: OracleMaps, source: OracleMaps) -> SubmodelFit:
-    return align_pointmaps(target.submodel, source.submodel, target, source, AlignmentConfig())
+    return align_pointmaps(target.submodel, source.submodel, target, source)
 
 
 def relative_depth(maps: OracleMaps, truth: TrueScene, k: int) -> FloatArray:

@@ -25,7 +25,7 @@ from smust3r_colmap.backbones.classical.mapped_model import MappedModel, model_f
 from smust3r_colmap.backbones.classical.mapping import ENOUGH_REGISTERED, MappedSegment, MappingTask, map_segment
 from smust3r_colmap.backbones.classical.model_checks import FOCAL_TOLERANCE, diverged_focal
 from smust3r_colmap.colmap.database import internal_name, open_database
-from smust3r_colmap.estimators.weighted_median import weighted_median
+from smust3r_colmap.estimators.robust import mad_sigma, weighted_median
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import UnregisteredImage
@@ -97,9 +97,8 @@ def are_certain(cameras: Collection[int], pilots: Sequence[MappedSegment], camer
 
 
 def _median_uncertainty(values: npt.NDArray[np.float64]) -> float:
-    """Standard error of the median: 1.25 sigma / sqrt(n), and sigma as 1.4826 median absolute deviations."""
-    deviation = float(np.median(np.abs(values - np.median(values))))
-    return 1.25 * 1.4826 * deviation / float(np.sqrt(len(values)))
+    """Standard error of the median: 1.25 sigma / sqrt(n)."""
+    return 1.25 * mad_sigma(values) / float(np.sqrt(len(values)))
 
 
 def _cameras_of(model: MappedModel, camera_of_image: Sequence[int]) -> dict[int, Intrinsics]:

@@ -28,9 +28,8 @@ from smust3r_colmap.backbones.must3r.pose_refinement import refine_pose
 from smust3r_colmap.backbones.must3r.preprocessing import NetworkWindow
 from smust3r_colmap.config import CameraFit
 from smust3r_colmap.errors import DegenerateAlignmentError
-from smust3r_colmap.estimators.robust import MAD_TO_SIGMA, evenly_chosen
+from smust3r_colmap.estimators.robust import evenly_chosen, trimmed_median
 from smust3r_colmap.estimators.sim3 import consensus_sim3
-from smust3r_colmap.estimators.weighted_median import weighted_median
 from smust3r_colmap.geometry.arrays import BoolArray, FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.geometry.se3 import SE3
@@ -49,8 +48,6 @@ CONFIDENCE_SHARE = 0.5
 more than half of the image."""
 MIN_PIXELS = 50
 """Confident pixels of an image from which a camera is taken; of 2,000, 2.5 %."""
-TRIMMING_ROUNDS = 6
-"""Of a median; each takes off what the one before no longer hides."""
 MAX_FOCAL_FACTOR = 2.0
 """Between the focal length that one image asks for and that of its camera; what is further off is no geometry."""
 INLIER_RESIDUAL = 0.05
@@ -403,20 +400,7 @@ def _ray_ratio(sightings: Sequence[Sighting], intrinsics: Intrinsics) -> float:
     length = np.linalg.norm(known, axis=1)
     use = length > 0  # not where undistortion failed either
     slopes = (predicted[use] * known[use]).sum(axis=1) / length[use] ** 2
-    return _trimmed_median(slopes, length[use])
-
-
-def _trimmed_median(values: FloatArray, weights: FloatArray) -> float:
-    """Weighted median of the values within three robust standard deviations of it; NaN where there are none."""
-    median = float("nan")
-    for _ in range(TRIMMING_ROUNDS):
-        if len(values) == 0:
-            break
-        median = weighted_median(values, weights)
-        distances = np.abs(values - median)
-        near = distances <= 3 * MAD_TO_SIGMA * weighted_median(distances, weights)
-        values, weights = values[near], weights[near]
-    return median
+    return trimmed_median(slopes, length[use])
 
 
 def _is_plausible(focal_px: float, prior: Intrinsics) -> bool:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from smust3r_colmap.errors import DegenerateAlignmentError
-from smust3r_colmap.estimators.robust import CAUCHY_TUNING, MAD_TO_SIGMA, TRIMMING_ROUNDS
+from smust3r_colmap.estimators.robust import CAUCHY_TUNING, robust_scale
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.so3 import skew
@@ -145,15 +145,5 @@ def _step(jacobians: FloatArray, residuals: FloatArray, weights: FloatArray) -> 
 def _sigmas(residuals: FloatArray) -> FloatArray:
     """(3,) robust standard deviations of the residuals (N, 3), the two across the ray counted as one length."""
     finite = residuals[np.isfinite(residuals[:, 0])]
-    across = _sigma(np.linalg.norm(finite[:, :2], axis=1))
-    return np.array([across, across, _sigma(np.abs(finite[:, 2]))])
-
-
-def _sigma(distances: FloatArray) -> float:
-    """Robust standard deviation: of the median of those within three of it, which wrong points do not inflate."""
-    rising = np.sort(distances)
-    num_near, sigma = len(rising), 0.0
-    for _ in range(TRIMMING_ROUNDS):
-        sigma = max(MAD_TO_SIGMA * float(rising[(num_near - 1) // 2]), SMALLEST_SIGMA)
-        num_near = int(np.searchsorted(rising, 3 * sigma, side="right"))
-    return sigma
+    across = robust_scale(np.linalg.norm(finite[:, :2], axis=1), floor=SMALLEST_SIGMA)
+    return np.array([across, across, robust_scale(np.abs(finite[:, 2]), floor=SMALLEST_SIGMA)])

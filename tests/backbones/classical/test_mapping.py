@@ -44,7 +44,6 @@ from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
 from smust3r_colmap.colmap.database import open_database, write_images
 from smust3r_colmap.config import ClassicalConfig
 from smust3r_colmap.errors import StorageError
-from smust3r_colmap.estimators.weighted_median import weighted_median
 from smust3r_colmap.execution.progress import QuietReporter
 from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.execution.task_pool import TaskFailure, TaskPool, TaskResult
@@ -379,13 +378,6 @@ def test_further_mappers_are_tried_only_where_enough_pairs_link_the_halves(
 
 
 # ---------------------------------------------------------------------- calibration
-def test_the_weighted_median_follows_the_weight() -> None:
-    values = np.array([1.0, 2.0, 30.0])
-    assert weighted_median(values, np.array([1.0, 1.0, 1.0])) == 2.0
-    assert weighted_median(values, np.array([1.0, 1.0, 100.0])) == pytest.approx(30.0, abs=1.0)
-    assert weighted_median(np.array([5.0]), np.array([0.1])) == 5.0
-
-
 START = Intrinsics(model="SIMPLE_RADIAL", width=640, height=480, params=(700.0, 320.0, 240.0, 0.0))
 
 
