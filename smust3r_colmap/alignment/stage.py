@@ -27,7 +27,7 @@ class EdgeSummary:
 
     Args:
         target, source: names of the submodels.
-        evidence: what it rests on: tracks, pointmaps, poses or links.
+        evidence: what it rests on: tracks, pointmaps, poses or matches.
         relative_residual: median residual divided by depth; NaN when no transform was found.
         accepted: it took part in the stitching.
         reason: why it was refused, or empty.
