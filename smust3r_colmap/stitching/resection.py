@@ -1,23 +1,24 @@
 """Placing the cameras of a submodel in the world when the world is not a mere similarity of the submodel.
 
-Under Sim(3) and SE(3) a camera moves with its submodel. Affine(3) and SL(4) bend the submodel, and no rigid
-camera sees the bent points quite as the submodel's own camera saw the straight ones: it is found anew,
-image by image, and what remains is reported in pixels. The next module to read is ``camera_fusion``.
+Under Sim(3) and SE(3) a camera moves with its submodel. Affine(3) and SL(4) deform the submodel, and no rigid
+camera sees the deformed points exactly as the submodel's own camera saw the original ones. Its pose is
+estimated by resection, image by image, and the residual is reported in pixels.
+The next module to read is ``camera_fusion``.
 """
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import pycolmap
 
 from smust3r_colmap.errors import DegenerateAlignmentError
+from smust3r_colmap.estimators.robust import evenly_chosen
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.se3 import SE3
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
-from smust3r_colmap.geometry.so3 import skew
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import DenseMaps, Submodel
 
@@ -27,12 +28,10 @@ POINTS_PER_IMAGE = 400
 """Points that place one camera; its six parameters are smooth functions of all of them."""
 MIN_POINTS = 6
 """Fewer points than this place no camera; three do in theory, with four solutions."""
-MAX_ITERATIONS = 20
-"""Of Levenberg-Marquardt; 3 to 6 are usual."""
-FIRST_DAMPING = 1e-6
-"""Part of the diagonal added to the normal matrix: almost Gauss-Newton, for the start is near."""
-CONVERGED_STEP = 1e-9
-"""Stop when no camera turns by more radians, or moves by a larger part of its points' depth."""
+LOSS_SCALE_PX = 1000.0
+"""Of pycolmap's Cauchy loss, which cannot be turned off: far above any residual, so that all points count alike."""
+GRADIENT_TOLERANCE = 1e-12
+"""Lets pycolmap iterate until the cost changes by less than a millionth."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,9 +73,9 @@ def place_submodel(
 
     Sim(3) and SE(3) move them exactly. In the wider groups each camera is resected from the points it
     saw: tracks where the submodel has them, else pixels of its pointmap. The pixel of a point is where
-    the submodel's own camera projects it, so the residual is what the bending adds and nothing else, and
-    a transform that happens to be a similarity gives zero. Levenberg-Marquardt over all images at once, from
-    the centre moved by the transform and the rotation nearest to its Jacobian there.
+    the submodel's own camera projects it, so the residual is that of the deformation alone, and a
+    transform that happens to be a similarity gives zero. pycolmap refines each pose from the centre moved
+    by the transform and the rotation nearest to its Jacobian there.
 
     Args:
         submodel: in its own frame.
@@ -90,9 +89,10 @@ def place_submodel(
     world_from_cam = moved_cameras(world_from_seg, submodel.seg_from_cam)
     residual_px = np.zeros(len(submodel.images))
     if not isinstance(world_from_seg, Sim3 | SE3):
-        cam_from_world, residual_px = _resected(
-            invert_rigid(world_from_cam), _seen_points(submodel, maps, world_from_seg)
-        )
+        cam_from_world = invert_rigid(world_from_cam)
+        for k, intrinsics in enumerate(submodel.intrinsics):
+            points_world, xy = _seen_points(submodel, maps, world_from_seg, k)
+            cam_from_world[k], residual_px[k] = _resected(cam_from_world[k], points_world, xy, intrinsics.focal_px)
         world_from_cam = invert_rigid(cam_from_world)
         _warn_of_unseen(submodel, residual_px)
     return PlacedSubmodel(
@@ -134,38 +134,18 @@ def _warn_of_unseen(submodel: Submodel, residual_px: FloatArray) -> None:
 
 
 # ------------------------------------------------------------------------ correspondences
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _SeenPoints:
-    """What each of N cameras saw, filled up to P points of weight zero.
-
-    Args:
-        points_world: (N, P, 3), moved. xy: (N, P, 2) where they were seen, at z = 1 of the camera.
-        weights: (N, P) 1 or 0. focal_px: (N,) at the original image size.
-    """
-
-    points_world: FloatArray
-    xy: FloatArray
-    weights: FloatArray
-    focal_px: FloatArray
-
-
-def _seen_points(submodel: Submodel, maps: DenseMaps, world_from_seg: Transform) -> _SeenPoints:
-    n, p = len(submodel.images), POINTS_PER_IMAGE
-    points_world, xy, weights = np.zeros((n, p, 3)), np.zeros((n, p, 2)), np.zeros((n, p))
-    cam_from_seg = invert_rigid(submodel.seg_from_cam)
-    for k in range(n):
-        points_seg = _points_of_image(submodel, maps, k)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            points_cam = points_seg @ cam_from_seg[k, :, :3].T + cam_from_seg[k, :, 3]
-            moved = world_from_seg.apply(points_seg)
-            usable = np.isfinite(moved).all(axis=1) & (points_cam[:, 2] > 0)
-        rows = np.flatnonzero(usable)
-        rows = rows[np.arange(min(p, len(rows))) * len(rows) // max(min(p, len(rows)), 1)]
-        points_world[k, : len(rows)] = moved[rows]
-        xy[k, : len(rows)] = points_cam[rows, :2] / points_cam[rows, 2:]
-        weights[k, : len(rows)] = 1.0
-    focal_px = np.array([intrinsics.focal_px for intrinsics in submodel.intrinsics])
-    return _SeenPoints(points_world=points_world, xy=xy, weights=weights, focal_px=focal_px)
+def _seen_points(
+    submodel: Submodel, maps: DenseMaps, world_from_seg: Transform, k: int
+) -> tuple[FloatArray, FloatArray]:
+    """At most `POINTS_PER_IMAGE` moved points (P, 3) that image k sees, and where (P, 2), at z = 1 of its camera."""
+    points_seg = _points_of_image(submodel, maps, k)
+    cam_from_seg = invert_rigid(submodel.seg_from_cam[k])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        points_cam = points_seg @ cam_from_seg[:, :3].T + cam_from_seg[:, 3]
+        moved = world_from_seg.apply(points_seg)
+        usable = np.flatnonzero(np.isfinite(moved).all(axis=1) & (points_cam[:, 2] > 0))
+    rows = usable[evenly_chosen(len(usable), POINTS_PER_IMAGE)]
+    return moved[rows], points_cam[rows, :2] / points_cam[rows, 2:]
 
 
 def _points_of_image(submodel: Submodel, maps: DenseMaps, k: int) -> FloatArray:
@@ -179,72 +159,41 @@ def _points_of_image(submodel: Submodel, maps: DenseMaps, k: int) -> FloatArray:
 
 
 # ------------------------------------------------------------------------------ resection
-def _resected(cam_from_world: FloatArray, seen: _SeenPoints) -> tuple[FloatArray, FloatArray]:
-    """Rigid cameras (N, 3, 4) with the least squared distance in the image, and their residuals (N,) in px.
+def _resected(
+    cam_from_world: FloatArray, points_world: FloatArray, xy: FloatArray, focal_px: float
+) -> tuple[FloatArray, float]:
+    """The rigid camera (3, 4) with the least squared distance in the image, and its RMS residual in pixels.
 
-    Points behind a camera at the start have no part in it. A camera with too few points stays.
+    Points behind the camera at the start are ignored. A camera with too few points stays, with residual NaN.
     """
-    poses = cam_from_world.copy()
-    in_front = _points_cam(poses, seen)[:, :, 2] > 0
-    seen = replace(seen, weights=seen.weights * in_front)
-    enough = seen.weights.sum(axis=1) >= MIN_POINTS
-    error, damping = _squared_errors(poses, seen), np.full(len(poses), FIRST_DAMPING)
-    for _ in range(MAX_ITERATIONS):
-        steps, sizes = _steps(poses, seen, damping)
-        trial = _stepped(poses, steps)
-        trial_error = _squared_errors(trial, seen)
-        better = enough & (trial_error < error)
-        poses[better], error[better] = trial[better], trial_error[better]
-        damping = np.where(better, damping / 10, damping * 10)
-        if not (sizes[enough] > CONVERGED_STEP).any():
-            break
-    residual_px = seen.focal_px * np.sqrt(error / np.maximum(seen.weights.sum(axis=1), 1))
-    return poses, np.where(enough, residual_px, np.nan)
+    in_front = _points_cam(cam_from_world, points_world)[:, 2] > 0
+    if np.count_nonzero(in_front) < MIN_POINTS:
+        return cam_from_world, np.nan
+    points_world, xy = points_world[in_front], xy[in_front]
+    options = pycolmap.AbsolutePoseRefinementOptions()
+    options.loss_function_scale, options.gradient_tolerance = LOSS_SCALE_PX, GRADIENT_TOLERANCE
+    refined = pycolmap.refine_absolute_pose(
+        pycolmap.Rigid3d(pycolmap.Rotation3d(cam_from_world[:, :3]), cam_from_world[:, 3]),
+        focal_px * xy,
+        points_world,
+        np.ones(len(xy), dtype=np.bool_),
+        pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[focal_px, 0.0, 0.0]),
+        options,
+    )
+    poses = [cam_from_world] if refined is None else [cam_from_world, refined["cam_from_world"].matrix()]
+    residual, best = min((_rms(pose, points_world, xy), k) for k, pose in enumerate(poses))
+    return poses[best], focal_px * residual
 
 
-def _points_cam(cam_from_world: FloatArray, seen: _SeenPoints) -> FloatArray:
-    """(N, P, 3) the moved points in each camera."""
-    points: FloatArray = seen.points_world @ np.swapaxes(cam_from_world[:, :, :3], 1, 2) + cam_from_world[:, None, :, 3]
+def _points_cam(cam_from_world: FloatArray, points_world: FloatArray) -> FloatArray:
+    """(P, 3) points in the camera."""
+    points: FloatArray = points_world @ cam_from_world[:, :3].T + cam_from_world[:, 3]
     return points
 
 
-def _squared_errors(cam_from_world: FloatArray, seen: _SeenPoints) -> FloatArray:
-    """(N,) sum of squared distances at z = 1; infinite where a point went behind its camera."""
-    points = _points_cam(cam_from_world, seen)
-    used = seen.weights > 0
-    depth = np.where(used, points[:, :, 2], 1.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        squared = ((points[:, :, :2] / depth[:, :, None] - seen.xy) ** 2).sum(axis=2)
-    behind = (used & (depth <= 0)).any(axis=1)
-    return np.where(behind, np.inf, np.where(used, squared, 0.0).sum(axis=1))
-
-
-def _steps(cam_from_world: FloatArray, seen: _SeenPoints, damping: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(N, 6) damped Gauss-Newton steps (shift, turn) in the axes of each camera, and their sizes (N,).
-
-    A camera point X moves by shift + turn x X, its image by the derivative of (X / Z, Y / Z).
-    """
-    points = _points_cam(cam_from_world, seen)
-    inverse_depth = seen.weights / np.where(seen.weights > 0, points[:, :, 2], 1.0)
-    xy = points[:, :, :2] * inverse_depth[:, :, None]
-    by_point = np.zeros((*xy.shape, 3))
-    by_point[:, :, 0, 0] = by_point[:, :, 1, 1] = inverse_depth
-    by_point[:, :, :, 2] = -xy * inverse_depth[:, :, None]
-    jacobian = np.concatenate([by_point, -by_point @ skew(points)], axis=3)  # (N, P, 2, 6)
-    normal = np.einsum("npia,npib->nab", jacobian, jacobian)
-    gradient = np.einsum("npia,npi->na", jacobian, (seen.xy - xy) * seen.weights[:, :, None])
-    diagonal = np.einsum("naa->na", normal)
-    # A camera without points has a normal matrix of zeros and takes no step.
-    normal = normal + np.where(diagonal > 0, damping[:, None] * diagonal, 1.0)[:, :, None] * np.eye(6)
-    steps = np.linalg.solve(normal, gradient[:, :, None])[:, :, 0]
-    closeness = inverse_depth.sum(axis=1) / np.maximum(seen.weights.sum(axis=1), 1)
-    sizes = np.linalg.norm(steps * np.where(np.arange(6) < 3, closeness[:, None], 1.0), axis=1)
-    return steps, sizes
-
-
-def _stepped(cam_from_world: FloatArray, steps: FloatArray) -> FloatArray:
-    """Poses (N, 3, 4) after steps (N, 6) in the camera's axes."""
-    turns = Rotation.from_rotvec(steps[:, 3:]).as_matrix()
-    moved: FloatArray = turns @ cam_from_world
-    moved[:, :, 3] += steps[:, :3]
-    return moved
+def _rms(cam_from_world: FloatArray, points_world: FloatArray, xy: FloatArray) -> float:
+    """Root mean square distance at z = 1; infinite where a point lies behind the camera."""
+    points = _points_cam(cam_from_world, points_world)
+    if (points[:, 2] <= 0).any():
+        return np.inf
+    return float(np.sqrt(np.mean(((points[:, :2] / points[:, 2:] - xy) ** 2).sum(axis=1))))
