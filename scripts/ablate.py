@@ -55,6 +55,7 @@ from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.products import Edges, Segment
 from smust3r_colmap.segmentation.loop_segments import LoopPlan, PlannedLoop, plan_loops
 from smust3r_colmap.segmentation.stage import NOT_LOOKED_FOR
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.segmentation.windows import plan_windows
 from smust3r_colmap.stitching.camera_fusion import fuse_cameras
 from smust3r_colmap.stitching.resection import PlacedSubmodel, place_submodel
@@ -381,8 +382,9 @@ def with_drift_of_segments(errors: OracleSettings, length: int) -> OracleSetting
 
 def plan_segments(backbone: OracleBackbone, config: RunConfig) -> tuple[tuple[Segment, ...], LoopPlan]:
     """Windows, and the loops between them."""
+    graph = ViewGraph.chain(len(backbone.collection))
     windows = plan_windows(
-        len(backbone.collection),
+        graph,
         segment_length=config.segmentation.segment_length,
         overlap=config.segmentation.overlap,
     )
@@ -391,6 +393,7 @@ def plan_segments(backbone: OracleBackbone, config: RunConfig) -> tuple[tuple[Se
         return windows, NOT_LOOKED_FOR
     return windows, plan_loops(
         backbone.describe(),
+        graph,
         windows,
         similarity=closing.loop_similarity,
         min_candidates=closing.loop_min_candidates,

@@ -34,6 +34,7 @@ from smust3r_colmap.refinement.bundle_adjustment import ModelFigures
 from smust3r_colmap.refinement.global_refinement import STAYED, RefinedFigures, RefineTask, refine_scenes
 from smust3r_colmap.refinement.mapper import LOOSE_PART
 from smust3r_colmap.segmentation.stage import Segments
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.segmentation.windows import plan_windows
 from smust3r_colmap.stitching.stage import Stitched
 from smust3r_colmap.storage.codec import Codec
@@ -119,7 +120,8 @@ class InitialScenes:
         cls, scene: Scene, seen_by_tracks: Mapping[int, FloatArray], options: SegmentationConfig, *, tolerance: float
     ) -> InitialScenes:
         """The model of another program; what an image sees is known from its tracks, else from the points in it."""
-        windows = plan_windows(len(scene), segment_length=options.segment_length, overlap=options.overlap)
+        graph = ViewGraph.chain(len(scene))
+        windows = plan_windows(graph, segment_length=options.segment_length, overlap=options.overlap)
         return cls(
             scenes=(scene,),
             subsets=tuple(window.images for window in windows),

@@ -38,6 +38,7 @@ from smust3r_colmap.segmentation.similarity import (
     similarity_statistics,
     with_neighbours,
 )
+from smust3r_colmap.segmentation.view_graph import NO_WAY, ViewGraph
 
 # The thresholds: see the module docstring.
 _STRONG_SIGMAS = 4.0
@@ -148,6 +149,7 @@ class LoopPlan:
 
 def plan_loops(
     descriptors: npt.NDArray[np.float32],
+    graph: ViewGraph,
     windows: Sequence[Segment],
     *,
     similarity: float,
@@ -158,7 +160,8 @@ def plan_loops(
     """Find where the sequence came back to, and plan a segment for each loop.
 
     Args:
-        descriptors: (N, D) one unit vector per image in order; zero rows take no part.
+        descriptors: (N, D) one unit vector per image; zero rows take no part.
+        graph: the order of the N images.
         windows: segments of the sequence, ``windows[k].index == k``.
         similarity: cosine from which two images look alike; 0 takes it from the collection.
         min_candidates: image pairs that two segments need.
@@ -168,9 +171,9 @@ def plan_loops(
     Raises:
         InputError: descriptors that do not fit the collection, are not finite or not of unit length.
     """
-    num_images = 1 + max(max(window.images) for window in windows)
+    num_images = graph.num_images
     check_descriptors(descriptors, num_images)
-    statistics = similarity_statistics(descriptors)
+    statistics = similarity_statistics(descriptors, graph)
     if similarity > 0:
         compared, threshold, weak, reach = descriptors, similarity, similarity, 0
     elif statistics is None:
@@ -182,15 +185,16 @@ def plan_loops(
             f"far ones ({statistics.far_median:.3f}): the camera stood still, or the images are in no order",
         )
     else:
-        reach = neighbours_alike(descriptors, statistics, at_most=min(half_width, far_apart(num_images) // 3))
-        compared = with_neighbours(descriptors, reach)
-        statistics = similarity_statistics(compared)
+        reach = neighbours_alike(descriptors, graph, statistics, at_most=min(half_width, far_apart(num_images) // 3))
+        compared = with_neighbours(descriptors, graph, reach)
+        statistics = similarity_statistics(compared, graph)
         assert statistics is not None
         threshold, weak = _automatic_thresholds(statistics)
     alike = alike_segments(compared, home_segments([w.images for w in windows], num_images), at_least=weak)
     apart = [pair for pair in alike if set(windows[pair.segment_a].images).isdisjoint(windows[pair.segment_b].images)]
     apart.sort(key=lambda pair: (-pair.similarity, pair.image_a, pair.image_b))
     rules = _Rules(
+        graph=graph,
         threshold=threshold,
         weak_threshold=weak,
         min_candidates=min_candidates,
@@ -247,10 +251,12 @@ class _Rules:
     """The arguments of ``plan_loops``, and what it made of them for this collection.
 
     Args:
+        graph: the order of the images.
         weak_loops: loops below the threshold are taken only while there are fewer loops than this.
         radius: images, in both directions of time, within which two pairs show one revisit.
     """
 
+    graph: ViewGraph
     threshold: float
     weak_threshold: float
     min_candidates: int
@@ -270,7 +276,7 @@ def _choose(
         run_a = images_around(windows[pair.segment_a].images, pair.image_a, rules.half_width)
         run_b = images_around(windows[pair.segment_b].images, pair.image_b, rules.half_width)
         rejection = _pair_rejection(pair, rules) or _rejection_beside(pair, loops, rules)
-        if not rejection and run_a[-1] + 1 >= run_b[0]:
+        if not rejection and len(rules.graph.runs(run_a + run_b)) == 1:
             rejection = "the images around the two ends touch"
         if not rejection and not _left_in_between(pair, compared, rules):
             rejection = "the camera did not leave the place in between"
@@ -310,10 +316,12 @@ def _pair_rejection(pair: AlikeSegments, rules: _Rules) -> str:
 
 def _rejection_beside(pair: AlikeSegments, loops: Sequence[PlannedLoop], rules: _Rules) -> str:
     """The rejection reason beside the better loops that were taken, or empty."""
-    for loop in loops:
-        # A box in both directions of time: the second visit may run along the first or against it.
-        if abs(loop.image_a - pair.image_a) <= rules.radius and abs(loop.image_b - pair.image_b) <= rules.radius:
-            return f"suppressed by the better pair ({loop.image_a}, {loop.image_b}) within {rules.radius} images"
+    ends = np.array([(loop.image_a, loop.image_b) for loop in loops], dtype=np.int64).reshape(-1, 2)
+    # A box in both directions of time: the second visit may run along the first or against it.
+    near = (rules.graph.steps_between(ends, (pair.image_a, pair.image_b)) <= rules.radius).all(axis=1)
+    if near.any():
+        image_a, image_b = ends[near.argmax()]
+        return f"suppressed by the better pair ({image_a}, {image_b}) within {rules.radius} images"
     for segment in (pair.segment_a, pair.segment_b):
         if sum(segment in (loop.segment_a, loop.segment_b) for loop in loops) >= _LOOPS_PER_SEGMENT:
             return f"segment {segment} has {_LOOPS_PER_SEGMENT} better loops already"
@@ -326,9 +334,13 @@ def _left_in_between(pair: AlikeSegments, compared: Descriptors, rules: _Rules) 
     """A return needs a departure: enough images between the two ends look like neither.
 
     While a camera stands still, images any time apart look alike, and nothing is closed by saying so.
+    Another sequence is no return.
     """
-    step = 1 + (pair.image_b - pair.image_a) // _SAMPLED_IN_BETWEEN
-    between = compared[pair.image_a + 1 : pair.image_b : step]
+    apart = int(rules.graph.steps_between(pair.image_a, pair.image_b))
+    if apart == NO_WAY:
+        return True
+    step = 1 + apart // _SAMPLED_IN_BETWEEN
+    between = compared[rules.graph.between(pair.image_a, pair.image_b)[::step]]
     between = between[between.any(axis=1)]
     nearest = (between @ compared[[pair.image_a, pair.image_b]].T).max(axis=1, initial=-1.0)
     return bool((nearest < rules.weak_threshold).sum() * step >= rules.half_width)

@@ -39,6 +39,7 @@ import numpy.typing as npt
 from smust3r_colmap.errors import InputError
 from smust3r_colmap.estimators.robust import mad_sigma
 from smust3r_colmap.geometry.arrays import IntArray
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 
 Descriptors = npt.NDArray[np.float32]
 
@@ -110,17 +111,18 @@ def check_descriptors(descriptors: npt.NDArray[np.float32], num_images: int) -> 
         raise InputError(f"image {image}: its descriptor has length {length[image]:.4g}, needed 1 (or 0 for none)")
 
 
-def similarity_statistics(descriptors: Descriptors) -> SimilarityStatistics | None:
+def similarity_statistics(descriptors: Descriptors, graph: ViewGraph) -> SimilarityStatistics | None:
     """Cosines of far and of neighbouring images; None where fewer than two images or no far pair have one.
 
     Args:
-        descriptors: (N, D) unit rows in order; zero rows are left out.
+        descriptors: (N, D) unit rows; zero rows are left out.
+        graph: the order of the N images.
     """
-    neighbours = _cosines_apart(descriptors, 1)
+    neighbours = _cosines_apart(descriptors, graph, 1)
     images = np.flatnonzero(descriptors.any(axis=1))
     images = images[np.linspace(0, len(images) - 1, min(len(images), _SAMPLED_IMAGES)).astype(int)]
-    is_far = images[None, :] - images[:, None] >= far_apart(len(descriptors))
-    far = (descriptors[images] @ descriptors[images].T)[is_far]
+    is_far = graph.steps_between(images[:, None], images[None, :]) >= far_apart(len(descriptors))
+    far = (descriptors[images] @ descriptors[images].T)[np.triu(is_far)]
     if not len(far) or not len(neighbours):
         return None
     median = float(np.median(far))
@@ -136,45 +138,51 @@ def far_apart(num_images: int) -> int:
     return max(1, min(_FAR_APART, num_images // 3))
 
 
-def neighbours_alike(descriptors: Descriptors, statistics: SimilarityStatistics, *, at_most: int) -> int:
+def neighbours_alike(
+    descriptors: Descriptors, graph: ViewGraph, statistics: SimilarityStatistics, *, at_most: int
+) -> int:
     """How many images to each side show much of the same view.
 
     Up to there the excess over far images is at least half of that of adjacent images; 3 on the walks
     at two images a second, more in a video.
 
     Args:
-        descriptors: (N, D) unit rows in order; zero rows are left out.
+        descriptors: (N, D) unit rows; zero rows are left out.
+        graph: the order of the N images.
         statistics: of these descriptors.
         at_most: upper bound of the answer.
     """
     half = (statistics.neighbour_median + statistics.far_median) / 2
     for step in range(1, min(at_most + 1, len(descriptors))):
-        cosines = _cosines_apart(descriptors, step)
+        cosines = _cosines_apart(descriptors, graph, step)
         if not len(cosines) or np.median(cosines) < half:
             return step - 1
     return at_most
 
 
-def _cosines_apart(descriptors: Descriptors, step: int) -> Descriptors:
-    """Cosines of all pairs of described images ``step`` apart in order."""
+def _cosines_apart(descriptors: Descriptors, graph: ViewGraph, steps: int) -> Descriptors:
+    """Cosines of all pairs of described images so many steps apart in order."""
+    pairs = graph.pairs_apart(steps)
     described: npt.NDArray[np.bool_] = np.any(descriptors, axis=1)
-    both = described[:-step] & described[step:]
-    cosines: Descriptors = np.einsum("nd,nd->n", descriptors[:-step][both], descriptors[step:][both])
+    first, second = pairs[described[pairs].all(axis=1)].T
+    cosines: Descriptors = np.einsum("nd,nd->n", descriptors[first], descriptors[second])
     return cosines
 
 
-def with_neighbours(descriptors: Descriptors, reach: int) -> Descriptors:
+def with_neighbours(descriptors: Descriptors, graph: ViewGraph, reach: int) -> Descriptors:
     """(N, D) unit means of each descriptor and its neighbours in order.
 
     Args:
         descriptors: (N, D) unit rows; zero rows stay zero.
+        graph: the order of the N images.
         reach: images to each side; weights fall linearly to zero just beyond. 0 changes nothing.
     """
     total = (reach + 1) * descriptors
     for step in range(1, min(reach + 1, len(descriptors))):
         weight = reach + 1 - step
-        total[step:] += weight * descriptors[:-step]
-        total[:-step] += weight * descriptors[step:]
+        first, second = graph.pairs_apart(step).T
+        total[second] += weight * descriptors[first]
+        total[first] += weight * descriptors[second]
     total[~descriptors.any(axis=1)] = 0
     unit: Descriptors = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-9)
     return unit

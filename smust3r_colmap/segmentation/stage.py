@@ -1,6 +1,6 @@
 """Which images are reconstructed together: windows of the sequence, and a segment for each loop (paper III-B, III-F).
 
-The next module to read is ``windows``.
+The next module to read is ``view_graph``.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.geometry.arrays import Float32Array
 from smust3r_colmap.products import Segment
 from smust3r_colmap.segmentation.loop_segments import LoopPlan, plan_loops
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.segmentation.windows import plan_windows
 from smust3r_colmap.storage.codec import Codec
 
@@ -22,17 +23,24 @@ NOT_LOOKED_FOR = LoopPlan(threshold=None, weak_threshold=None, neighbours=0, sta
 _LOOPS: Codec[LoopPlan] = Codec(LoopPlan, "plan")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Segments:
     """The segments of a run.
 
     Args:
-        windows: of the sequence, ``windows[k].index == k``.
+        view_graph: which images may see the same place; the ends of every planned loop are a pair in it.
+        windows: of its sequences, ``windows[k].index == k``.
         loops: that were planned; their segments are numbered on from the windows.
     """
 
+    view_graph: ViewGraph
     windows: tuple[Segment, ...]
     loops: LoopPlan
+
+    def __post_init__(self) -> None:
+        for loop in self.loops.loops:
+            if not self.view_graph.are_neighbours(loop.image_a, loop.image_b):
+                raise ValueError(f"Segments: loop ({loop.image_a}, {loop.image_b}) is no pair of the view graph")
 
     @property
     def all(self) -> tuple[Segment, ...]:
@@ -57,14 +65,16 @@ def plan(
     Args:
         describe: (N, D) unit vectors, one per image; called where loops are wanted.
     """
-    windows = plan_windows(num_images, segment_length=segmentation.segment_length, overlap=segmentation.overlap)
+    graph = ViewGraph.chain(num_images)
+    windows = plan_windows(graph, segment_length=segmentation.segment_length, overlap=segmentation.overlap)
     if not loop_closing.loops:
-        return Segments(windows=windows, loops=NOT_LOOKED_FOR)
+        return Segments(view_graph=graph, windows=windows, loops=NOT_LOOKED_FOR)
     descriptors = describe()
 
     def compute(progress: Stage) -> LoopPlan:
         planned = plan_loops(
             descriptors,
+            graph,
             windows,
             similarity=loop_closing.loop_similarity,
             min_candidates=loop_closing.loop_min_candidates,
@@ -74,4 +84,10 @@ def plan(
         progress.advance()
         return planned
 
-    return Segments(windows=windows, loops=run.cached("loops", (descriptors, windows, loop_closing), compute, _LOOPS))
+    loops = run.cached("loops", (descriptors, graph, windows, loop_closing), compute, _LOOPS)
+    found = graph.with_pairs(
+        [(loop.image_a, loop.image_b) for loop in loops.loops],
+        "retrieval",
+        weights=[loop.similarity for loop in loops.loops],
+    )
+    return Segments(view_graph=found, windows=windows, loops=loops)

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from smust3r_colmap.errors import CollectionError, ConfigError
 from smust3r_colmap.products import Segment
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 
 
-def plan_windows(num_images: int, *, segment_length: int, overlap: int) -> tuple[Segment, ...]:
-    """Windows of l images, neighbours sharing at least p: 1..l, l-p+1..2l-p, and so on.
+def plan_windows(graph: ViewGraph, *, segment_length: int, overlap: int) -> tuple[Segment, ...]:
+    """Windows of l images over every sequence, neighbours sharing at least p: 1..l, l-p+1..2l-p, and so on.
 
     Where the last window would run past the end it is shifted back until it ends at the last image.
     Every window so has exactly l images and no short tail can arise: a tail of a few images has little
@@ -20,13 +21,13 @@ def plan_windows(num_images: int, *, segment_length: int, overlap: int) -> tuple
     images appended to a collection leave the finished windows as they are.
 
     Args:
-        num_images: in the collection, at least 2; up to l of them make one segment.
+        graph: of at least 2 images; up to l images of a sequence make one segment.
         segment_length: l, at least 2.
         overlap: p, from 1 to l - 1.
 
     Raises:
         ConfigError: l or p is outside these bounds.
-        CollectionError: fewer than 2 images.
+        CollectionError: fewer than 2 images, or an image is in no sequence.
     """
     if segment_length < 2:
         raise ConfigError(f"segment length {segment_length}: a segment needs at least 2 images")
@@ -35,9 +36,14 @@ def plan_windows(num_images: int, *, segment_length: int, overlap: int) -> tuple
             f"overlap {overlap}: neighbouring segments of {segment_length} images must share "
             f"between 1 and {segment_length - 1}"
         )
-    if num_images < 2:
-        raise CollectionError(f"{num_images} usable images: a reconstruction needs at least 2")
-    length = min(segment_length, num_images)
-    last_start = num_images - length
-    starts = [*range(0, last_start, segment_length - overlap), last_start]
-    return tuple(Segment(index=index, images=tuple(range(start, start + length))) for index, start in enumerate(starts))
+    if graph.num_images < 2:
+        raise CollectionError(f"{graph.num_images} usable images: a reconstruction needs at least 2")
+    windows: list[tuple[int, ...]] = []
+    for images in (sequence.tolist() for sequence in graph.sequences):
+        if len(images) < 2:
+            raise CollectionError(f"image {images[0]} is next to no other in order: windows need sequences")
+        length = min(segment_length, len(images))
+        last_start = len(images) - length
+        starts = [*range(0, last_start, segment_length - overlap), last_start]
+        windows += [tuple(images[start : start + length]) for start in starts]
+    return tuple(Segment(index=index, images=images) for index, images in enumerate(windows))

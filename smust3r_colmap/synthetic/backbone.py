@@ -2,7 +2,7 @@
 
     truth = TrueScene.from_demo(200, 72, 96)
     backbone = OracleBackbone(truth, collection_of(truth), PRESETS["network"], seed=0)
-    result = backbone.reconstruct(plan_windows(200, segment_length=60, overlap=30), with_maps=range(6))
+    result = backbone.reconstruct(plan_windows(ViewGraph.chain(200), segment_length=60, overlap=30), with_maps=range(6))
 
 Everything stays in memory; maps are made when they are read. A segment comes out the same whatever
 else is asked for: its errors depend on the seed, its images and its kind alone.

@@ -21,6 +21,7 @@ from smust3r_colmap.segmentation.similarity import (
     similarity_statistics,
     with_neighbours,
 )
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.segmentation.windows import plan_windows
 
 Array = npt.NDArray[np.float32]
@@ -70,9 +71,11 @@ def plan(
     min_distance: int = 3,
     half_width: int = 10,
 ) -> LoopPlan:
+    graph = ViewGraph.chain(len(descriptors))
     return plan_loops(
         descriptors,
-        plan_windows(len(descriptors), segment_length=length, overlap=overlap),
+        graph,
+        plan_windows(graph, segment_length=length, overlap=overlap),
         similarity=similarity,
         min_candidates=min_candidates,
         min_distance=min_distance,
@@ -86,7 +89,7 @@ def ends(found: LoopPlan) -> list[tuple[int, int]]:
 
 # ------------------------------------------------------------------------------ finding
 def test_simulated_neighbours_are_as_alike_as_real_ones() -> None:
-    statistics = similarity_statistics(see(straight(300)))
+    statistics = similarity_statistics(see(straight(300)), ViewGraph.chain(300))
     assert statistics is not None
     assert 0.15 < statistics.neighbour_median < 0.35
     assert abs(statistics.far_median) < 0.02
@@ -131,7 +134,7 @@ def test_neighbours_in_time_find_a_loop_that_single_images_do_not() -> None:
     places[240:265] = places[20:45]
     descriptors = see(places, noise=3.0)
     singles = descriptors[20:45] @ descriptors[240:265].T
-    statistics = similarity_statistics(descriptors)
+    statistics = similarity_statistics(descriptors, ViewGraph.chain(len(descriptors)))
     assert statistics is not None
     assert np.median(np.diag(singles)) < statistics.far_median + 2.5 * statistics.far_sigma
     found = plan(descriptors)
@@ -203,7 +206,7 @@ def test_segments_near_in_order_are_no_loop() -> None:
 
 
 def test_segments_that_share_images_are_not_even_candidates() -> None:
-    windows = plan_windows(100, segment_length=40, overlap=35)
+    windows = plan_windows(ViewGraph.chain(100), segment_length=40, overlap=35)
     found = plan(see(straight(100)), length=40, overlap=35, min_distance=1)
     for one in found.candidates:
         assert set(windows[one.segment_a].images).isdisjoint(windows[one.segment_b].images)
@@ -226,7 +229,7 @@ def test_images_without_features_take_no_part() -> None:
     blank = see(straight(300))
     blank[10:40] = blank[200:230] = 0
     assert plan(blank).loops == ()
-    assert not with_neighbours(blank, 3)[10:40].any()
+    assert not with_neighbours(blank, ViewGraph.chain(len(blank)), 3)[10:40].any()
 
 
 # --------------------------------------------------------------------------------- laws
@@ -245,7 +248,7 @@ def places_of(kind: str) -> npt.NDArray[np.float64]:
 )
 def test_laws_of_plans(kind: str, length: int, overlap: int, similarity: float) -> None:
     descriptors = see(places_of(kind))
-    windows = plan_windows(400, segment_length=length, overlap=overlap)
+    windows = plan_windows(ViewGraph.chain(400), segment_length=length, overlap=overlap)
     found = plan(descriptors, length=length, overlap=overlap, similarity=similarity)
     assert found == plan(descriptors, length=length, overlap=overlap, similarity=similarity)
     used = Counter(segment for loop in found.loops for segment in (loop.segment_a, loop.segment_b))
@@ -270,7 +273,7 @@ def test_laws_of_plans(kind: str, length: int, overlap: int, similarity: float) 
 
 def test_what_is_not_looked_at_is_counted() -> None:
     found = plan(see(straight(1200) % 70, noise=0.5), length=12, overlap=1, similarity=0.1)
-    assert len(found.candidates) == 20 * len(plan_windows(1200, segment_length=12, overlap=1))
+    assert len(found.candidates) == 20 * len(plan_windows(ViewGraph.chain(1200), segment_length=12, overlap=1))
     assert found.num_left_out > 0
     assert any("better loops already" in one.reason for one in found.candidates)
 
@@ -292,7 +295,9 @@ def test_time_reversed_gives_the_same_loops() -> None:
 def test_pairs_are_those_of_a_kd_tree() -> None:
     """The paper searches a KD-tree by radius; |x - y|^2 = 2 - 2 cos."""
     descriptors = see(places_of("wandering"))
-    home = home_segments([window.images for window in plan_windows(400, segment_length=60, overlap=30)], 400)
+    home = home_segments(
+        [window.images for window in plan_windows(ViewGraph.chain(400), segment_length=60, overlap=30)], 400
+    )
     counted: Counter[tuple[int, int]] = Counter()
     for a, b in KDTree(descriptors).query_pairs(np.sqrt(2 - 2 * 0.2)):
         if home[a] != home[b]:
@@ -304,7 +309,9 @@ def test_pairs_are_those_of_a_kd_tree() -> None:
 
 def test_best_pairs_are_those_of_all_cosines() -> None:
     descriptors = see(places_of("rounds"))
-    home = home_segments([window.images for window in plan_windows(400, segment_length=50, overlap=10)], 400)
+    home = home_segments(
+        [window.images for window in plan_windows(ViewGraph.chain(400), segment_length=50, overlap=10)], 400
+    )
     home[:10] = -1
     cosines = descriptors @ descriptors.T
     for pair in alike_segments(descriptors, home, at_least=0.3):
@@ -321,19 +328,19 @@ def test_home_is_where_an_image_lies_most_central() -> None:
 
 def test_smoothing_keeps_unit_length_and_its_weights_are_a_triangle() -> None:
     basis = np.eye(9, dtype=np.float32)
-    smooth = with_neighbours(basis, 2)
+    smooth = with_neighbours(basis, ViewGraph.chain(9), 2)
     np.testing.assert_allclose(smooth[4], np.array([0, 0, 1, 2, 3, 2, 1, 0, 0]) / np.sqrt(19), atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(smooth, axis=1), 1, atol=1e-6)
-    np.testing.assert_array_equal(with_neighbours(basis, 0), basis)
+    np.testing.assert_array_equal(with_neighbours(basis, ViewGraph.chain(9), 0), basis)
 
 
 def test_slower_walks_are_compared_with_more_neighbours() -> None:
     reaches = []
     for slowness in (1, 2, 4):
         descriptors = see(straight(400) / slowness)
-        statistics = similarity_statistics(descriptors)
+        statistics = similarity_statistics(descriptors, ViewGraph.chain(len(descriptors)))
         assert statistics is not None
-        reaches.append(neighbours_alike(descriptors, statistics, at_most=10))
+        reaches.append(neighbours_alike(descriptors, ViewGraph.chain(len(descriptors)), statistics, at_most=10))
     assert 1 <= reaches[0] < reaches[1] < reaches[2] <= 10
     assert reaches[0] <= 4
 
@@ -354,7 +361,13 @@ def test_ends_that_touch_are_no_loop() -> None:
     places[72:84] = places[57:45:-1]
     windows = [Segment(index=k, images=tuple(range(60 * k, 60 * k + 60))) for k in range(2)]
     settings = {"similarity": 0.3, "min_candidates": 1, "min_distance": 1}
-    touching = plan_loops(see(places, noise=0.3), windows, half_width=30, **settings)  # type: ignore[arg-type]
+    touching = plan_loops(
+        see(places, noise=0.3),
+        ViewGraph.chain(120),
+        windows,
+        half_width=30,
+        **settings,  # type: ignore[arg-type]
+    )
     assert [one.reason for one in touching.candidates] == ["the images around the two ends touch"]
 
 
@@ -386,7 +399,8 @@ def test_descriptors_that_do_not_fit_the_collection_are_refused(shape: tuple[int
     with pytest.raises(InputError, match="needed one row for each of 100 images"):
         plan_loops(
             np.zeros(shape, np.float32),
-            plan_windows(100, segment_length=60, overlap=30),
+            ViewGraph.chain(100),
+            plan_windows(ViewGraph.chain(100), segment_length=60, overlap=30),
             similarity=0.0,
             min_candidates=3,
             min_distance=3,

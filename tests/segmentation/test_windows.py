@@ -7,6 +7,7 @@ import itertools
 import pytest
 
 from smust3r_colmap.errors import CollectionError, ConfigError
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.segmentation.windows import plan_windows
 
 GRID = [
@@ -18,7 +19,9 @@ GRID = [
 
 
 def windows(num_images: int, length: int, overlap: int) -> list[tuple[int, ...]]:
-    return [segment.images for segment in plan_windows(num_images, segment_length=length, overlap=overlap)]
+    return [
+        segment.images for segment in plan_windows(ViewGraph.chain(num_images), segment_length=length, overlap=overlap)
+    ]
 
 
 def test_windows_are_the_papers() -> None:
@@ -55,7 +58,7 @@ def test_laws_of_windows(num_images: int, length: int, overlap: int) -> None:
 
 
 def test_indices_number_the_plan() -> None:
-    plan = plan_windows(200, segment_length=30, overlap=10)
+    plan = plan_windows(ViewGraph.chain(200), segment_length=30, overlap=10)
     assert [segment.index for segment in plan] == list(range(len(plan)))
     assert {segment.kind for segment in plan} == {"window"}
 
@@ -77,10 +80,10 @@ def test_appended_images_leave_finished_windows_alone() -> None:
 )
 def test_nonsense_is_refused_with_its_numbers(length: int, overlap: int, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        plan_windows(100, segment_length=length, overlap=overlap)
+        plan_windows(ViewGraph.chain(100), segment_length=length, overlap=overlap)
 
 
 @pytest.mark.parametrize("num_images", [0, 1])
 def test_fewer_than_two_images_are_refused(num_images: int) -> None:
     with pytest.raises(CollectionError, match=rf"{num_images} usable images: a reconstruction needs at least 2"):
-        plan_windows(num_images, segment_length=60, overlap=30)
+        plan_windows(ViewGraph.chain(num_images), segment_length=60, overlap=30)

@@ -24,6 +24,7 @@ from smust3r_colmap.products import (
 )
 from smust3r_colmap.segmentation.loop_segments import PlannedLoop
 from smust3r_colmap.segmentation.stage import NOT_LOOKED_FOR, Segments
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.stitching import stage as stitching_stage
 from smust3r_colmap.stitching import stitch as stitching
 from smust3r_colmap.stitching.loop_verification import LoopDecision, UncertainTransform, covariance_of
@@ -342,6 +343,6 @@ def test_a_chain_that_cannot_be_drawn_costs_the_comparison_and_not_the_run(
 
     monkeypatch.setattr(stitching_stage, "place_submodel", beyond_infinity)
     collection = ImageCollection(images=(), cameras=())
-    segments = Segments(windows=(), loops=NOT_LOOKED_FOR)
+    segments = Segments(view_graph=ViewGraph.chain(0), windows=(), loops=NOT_LOOKED_FOR)
     with quiet_run(tmp_path / "out") as run:
         assert stitching_stage._without_loops(run, result, segments, found.chained, collection) is None

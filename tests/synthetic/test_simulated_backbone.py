@@ -20,6 +20,7 @@ from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres, pointmap_from_depth
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
 from smust3r_colmap.products import ImageCollection, Segment
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.segmentation.windows import plan_windows
 from smust3r_colmap.synthetic.backbone import (
     OracleBackbone,
@@ -78,7 +79,7 @@ def rms(values: Sequence[float] | FloatArray) -> float:
 
 # --------------------------------------------------------------------------------- truth
 def test_perfect_neighbours_align_to_their_true_relation(truth: TrueScene) -> None:
-    windows = plan_windows(NUM_IMAGES, segment_length=60, overlap=30)
+    windows = plan_windows(ViewGraph.chain(NUM_IMAGES), segment_length=60, overlap=30)
     submodels = submodels_of(oracle(truth, PERFECT), windows)
     assert len(submodels) == 3
     for target, source in ((0, 1), (1, 2)):
@@ -194,7 +195,7 @@ def test_drift_of_the_scale_is_in_depths_and_in_steps(truth: TrueScene) -> None:
 
 def test_drift_of_the_chain_has_the_stated_size_and_no_overlap_shows_it(truth: TrueScene) -> None:
     settings = replace(PERFECT, chain_rotation_deg=3.0, chain_scale=0.05)
-    windows = plan_windows(NUM_IMAGES, segment_length=61, overlap=30)
+    windows = plan_windows(ViewGraph.chain(NUM_IMAGES), segment_length=61, overlap=30)
     first, second, _ = submodels_of(oracle(truth, settings), windows)
     for maps in (first, second):
         scale = np.cbrt(np.linalg.det(local_change(maps)[:3, :3]))
@@ -206,7 +207,7 @@ def test_drift_of_the_chain_has_the_stated_size_and_no_overlap_shows_it(truth: T
 
 
 def test_own_drift_makes_neighbours_disagree_on_the_overlap(truth: TrueScene) -> None:
-    windows = plan_windows(NUM_IMAGES, segment_length=60, overlap=30)
+    windows = plan_windows(ViewGraph.chain(NUM_IMAGES), segment_length=60, overlap=30)
     network = [submodels_of(oracle(truth, OracleSettings(), seed), windows) for seed in range(10)]
     relations = [true_relation(first, second) for first, second, _ in network]
     assert 0.1 < np.mean([one.spread_rotation_deg for one in relations]) < 0.5
@@ -376,7 +377,7 @@ class CountedViews:
 def test_maps_are_made_when_they_are_read(truth: TrueScene) -> None:
     views = CountedViews(truth)
     counted = replace(truth, views=views)
-    windows = plan_windows(NUM_IMAGES, segment_length=60, overlap=30)
+    windows = plan_windows(ViewGraph.chain(NUM_IMAGES), segment_length=60, overlap=30)
     result = oracle(counted, OracleSettings()).reconstruct(windows, with_maps=range(3))
     assert len(views.depths) <= TYPICAL_DEPTH_IMAGES + 1, "some for the size of the scene, one for the key"
     assert len(views.rgbs) <= 1
@@ -605,7 +606,7 @@ def test_kitchen_becomes_segments_with_depth_in_every_frame(data_dir: Callable[[
     assert (len(kitchen), kitchen.intrinsics.width, kitchen.intrinsics.height) == (24, 64, 48)
     assert 1.0 < kitchen.typical_depth < 3.0
     assert min(np.mean(kitchen.depth(k) > 0) for k in range(24)) > 0.7
-    windows = plan_windows(24, segment_length=16, overlap=8)
+    windows = plan_windows(ViewGraph.chain(24), segment_length=16, overlap=8)
     target, source = submodels_of(oracle(kitchen, PERFECT), windows)
     found = aligned(target, source)
     np.testing.assert_allclose(
