@@ -7,20 +7,22 @@ stand, says which of it belongs together. The next module to read is ``exports``
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from smust3r_colmap.colmap.model_files import MODEL_FILES
 from smust3r_colmap.errors import CollectionError, ImageError, InputError, RunDirectoryError
+from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.importers.image_folder import FolderScan, ImportRecord
-from smust3r_colmap.importers.image_scan import store_scan
+from smust3r_colmap.importers.image_scan import RECORDS, is_of_another_version, store_scan
 from smust3r_colmap.importers.masks import MaskSet, check_masks
 from smust3r_colmap.products import DepthMaps, Scene
+from smust3r_colmap.storage.codec import Codec
 from smust3r_colmap.storage.depth_maps import StoredDepthMaps
 from smust3r_colmap.storage.run_directory import (
     DATABASE_FILE,
+    FORMAT_VERSION,
     IMPORT_STAGE,
     MODEL_FOLDER,
     REFINED_STAGE,
@@ -29,11 +31,24 @@ from smust3r_colmap.storage.run_directory import (
     RunDirectory,
     read_json,
     storage_errors,
-    write_json,
 )
 from smust3r_colmap.storage.scenes import FUSED_SCENES
 
 FINISHED_FILE = "finished.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Parts:
+    """What ``finished.json`` says: which version wrote it, and which products belong together."""
+
+    format_version: int
+    images: Path
+    with_tracks: tuple[bool, ...]
+    with_maps: bool
+    masks: MaskSet | None
+
+
+_PARTS: Codec[_Parts] = Codec(_Parts, "finished")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,16 +82,18 @@ class FinishedRun:
 
 def write_finished(run: RunDirectory, finished: FinishedRun) -> None:
     """Say that the run is complete, where its images are and which parts it has."""
-    facts = {
-        "images": str(finished.images.resolve()),
-        "with_tracks": [model is not None for model in finished.models],
-        "with_maps": finished.maps is not None,
-        "masks": None if finished.masks is None else _masks_to_json(finished.masks),
-    }
-    write_json(run.work / FINISHED_FILE, facts)
+    masks = finished.masks
+    parts = _Parts(
+        format_version=FORMAT_VERSION,
+        images=finished.images.resolve(),
+        with_tracks=tuple(model is not None for model in finished.models),
+        with_maps=finished.maps is not None,
+        masks=None if masks is None else replace(masks, folder=masks.folder.resolve()),
+    )
+    _PARTS.write(run.work, parts)
 
 
-def begin_stages(run: RunDirectory, scan: FolderScan, *, overwrite: bool) -> None:
+def begin_stages(run: Run, scan: FolderScan, *, overwrite: bool) -> None:
     """To be called before the stages change: until the run ends again, they do not belong together.
 
     And no earlier than the input is known to be of use, for until then the folder may hold a finished run.
@@ -86,10 +103,12 @@ def begin_stages(run: RunDirectory, scan: FolderScan, *, overwrite: bool) -> Non
         overwrite: throw away all that an earlier run left.
     """
     if overwrite:
-        run.start_over(MODEL_FILES)
-    with storage_errors(run.work):
-        (run.work / FINISHED_FILE).unlink(missing_ok=True)
-    store_scan(scan, run)
+        run.folder.start_over(MODEL_FILES)
+    elif is_of_another_version(run.folder):
+        run.clock.note(f"{run.folder.work}: was written by another version; everything is computed again")
+    with storage_errors(run.folder.work):
+        (run.folder.work / FINISHED_FILE).unlink(missing_ok=True)
+    store_scan(scan, run.folder)
 
 
 def check_is_finished(root: Path) -> None:
@@ -120,33 +139,29 @@ def open_finished(run: RunDirectory, *, images: Path | None = None, output: Path
         RunDirectoryError: the run was made by another version.
         StorageError: a stage cannot be read.
     """
-    facts = read_json(run.work / FINISHED_FILE)
-    try:
-        images_then, with_tracks, with_maps = Path(facts["images"]), facts["with_tracks"], facts["with_maps"]
-        masks = _masks_from_json(facts.get("masks"))
-    except (KeyError, TypeError, AttributeError) as error:
-        raise RunDirectoryError(
-            f"{run.work / FINISHED_FILE}: was written by another version; start the same reconstruct command again"
-        ) from error
+    parts = _read_parts(run)
     refined = run.work / REFINED_STAGE
     return FinishedRun(
         output=run.root if output is None else output,
         native_log=run.native_log,
-        images=images_then if images is None else images,
+        images=parts.images if images is None else images,
         scenes=tuple(one.scene for one in FUSED_SCENES.read(run.work / SCENE_STAGE)),
-        models=tuple(refined / str(k) / MODEL_FOLDER if has else None for k, has in enumerate(with_tracks)),
-        database=refined / DATABASE_FILE if any(with_tracks) else None,
-        maps=StoredDepthMaps(run.work / STITCHED_STAGE) if with_maps else None,
-        masks=masks,
+        models=tuple(refined / str(k) / MODEL_FOLDER if has else None for k, has in enumerate(parts.with_tracks)),
+        database=refined / DATABASE_FILE if any(parts.with_tracks) else None,
+        maps=StoredDepthMaps(run.work / STITCHED_STAGE) if parts.with_maps else None,
+        masks=parts.masks,
     )
 
 
-def _masks_to_json(masks: MaskSet) -> dict[str, Any]:
-    return {"folder": str(masks.folder.resolve()), "digests": dict(masks.digest_of)}
-
-
-def _masks_from_json(facts: Mapping[str, Any] | None) -> MaskSet | None:
-    return None if facts is None else MaskSet(folder=Path(facts["folder"]), digest_of=dict(facts["digests"]))
+def _read_parts(run: RunDirectory) -> _Parts:
+    path = run.work / FINISHED_FILE
+    facts = read_json(path)
+    if not isinstance(facts, dict) or facts.get("format_version") != FORMAT_VERSION:
+        raise RunDirectoryError(f"{path}: was written by another version; start the same command again")
+    try:
+        return _PARTS.read(run.work)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise RunDirectoryError(f"{path}: is damaged ({error}); start the same command again") from error
 
 
 # -------------------------------------------------------------------- images and masks
@@ -161,8 +176,7 @@ def check_images(run: RunDirectory, finished: FinishedRun) -> None:
     """
     if not finished.images.is_dir():
         raise CollectionError(f"{finished.images}: the images are not there any more; say with --images where they are")
-    stored = read_json(run.work / IMPORT_STAGE / "records.json")
-    known = {record.name: record for record in map(ImportRecord.from_json, stored)}
+    known = {record.name: record for record in RECORDS.read(run.work / IMPORT_STAGE)}
     for name in _names(finished.scenes):
         _check_image(finished.images / name, known[name])
 

@@ -16,18 +16,17 @@ import unicodedata
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from statistics import median
-from typing import Any
 
 import pycolmap
 
 from smust3r_colmap.config import CameraMode, ImportConfig
 from smust3r_colmap.errors import CollectionError, ConfigError, ImageError
 from smust3r_colmap.geometry.camera import Intrinsics
-from smust3r_colmap.importers.camera_prior import DEFAULT_FOCAL_RATIO, CameraTags, focal_prior_px
+from smust3r_colmap.importers.camera_prior import DEFAULT_FOCAL_RATIO, focal_prior_px
 from smust3r_colmap.importers.images import MAX_FILE_BYTES, SUFFIXES, Photo, inspect
 from smust3r_colmap.products import ImageCollection, RejectedImage, SourceImage
 
@@ -63,22 +62,6 @@ class ImportRecord:
     def __post_init__(self) -> None:
         if (self.photo is None) != bool(self.reason):
             raise ValueError(f"{self.name}: a record has either a photo or a reason")
-
-    def to_json(self) -> dict[str, Any]:
-        """As plain dicts, strings and numbers."""
-        return asdict(self)
-
-    @classmethod
-    def from_json(cls, value: Mapping[str, Any]) -> ImportRecord:
-        """The inverse of ``to_json``.
-
-        Raises:
-            TypeError, KeyError: the value comes from another version; scan anew.
-        """
-        photo = value["photo"]
-        if photo is not None:
-            photo = Photo(**{**photo, "tags": CameraTags(**photo["tags"])})
-        return cls(**{**value, "photo": photo})
 
 
 @dataclass(frozen=True, kw_only=True)

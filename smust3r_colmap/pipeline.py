@@ -64,7 +64,7 @@ def reconstruct(
     with Run.open(output, workers=config.workers or usable_cores(), seed=config.seed, reporter=reporter) as run:
         scan, collection = importers.read_images(run, images, config, overwrite=overwrite)
         backbone = backbones.make(run, factory, collection, config)
-        begin_stages(run.folder, scan, overwrite=overwrite)
+        begin_stages(run, scan, overwrite=overwrite)
         segments = segmentation.plan(run, len(collection), backbone.describe, config.segmentation, config.loop_closing)
         submodels = backbones.reconstruct(backbone, segments, collection, config.alignment)
         edges = alignment.align(run, submodels, segments, config.alignment)

@@ -66,7 +66,7 @@ def refine_model(
     importers.check_model_is_kept(external.folder, output)
     with Run.open(output, workers=config.workers or usable_cores(), seed=config.seed, reporter=reporter) as run:
         scan, fitted = importers.fit_model(run, external, images, config, cameras, overwrite=overwrite)
-        begin_stages(run.folder, scan, overwrite=overwrite)
+        begin_stages(run, scan, overwrite=overwrite)
         start = fitted.scene(origin=external.folder.name)
         features = match_external(
             run, fitted.collection, start, config.classical, per_image=config.refinement.track_neighbours

@@ -18,9 +18,8 @@ How similar is similar enough:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -128,23 +127,6 @@ class LoopPlan:
         taken = {(one.segment_a, one.segment_b) for one in self.candidates if one.taken}
         if taken != {(loop.segment_a, loop.segment_b) for loop in self.loops} or len(taken) != len(self.loops):
             raise ValueError(f"LoopPlan: {len(taken)} candidates were taken for {len(self.loops)} loops")
-
-    def to_json(self) -> dict[str, Any]:
-        """As plain values; ``from_json`` is its inverse."""
-        return asdict(self)
-
-    @classmethod
-    def from_json(cls, facts: Mapping[str, Any]) -> LoopPlan:
-        """What ``to_json`` gave, also after a passage through a file."""
-        statistics = facts["statistics"]
-        return cls(
-            **{
-                **facts,
-                "statistics": None if statistics is None else SimilarityStatistics(**statistics),
-                "candidates": tuple(LoopCandidate(**one) for one in facts["candidates"]),
-                "loops": tuple(_planned_loop(one) for one in facts["loops"]),
-            }
-        )
 
 
 def plan_loops(
@@ -344,9 +326,3 @@ def _left_in_between(pair: AlikeSegments, compared: Descriptors, rules: _Rules) 
     between = between[between.any(axis=1)]
     nearest = (between @ compared[[pair.image_a, pair.image_b]].T).max(axis=1, initial=-1.0)
     return bool((nearest < rules.weak_threshold).sum() * step >= rules.half_width)
-
-
-# --------------------------------------------------------------------------------- JSON
-def _planned_loop(facts: Mapping[str, Any]) -> PlannedLoop:
-    segment = facts["segment"]
-    return PlannedLoop(**{**facts, "segment": Segment(**{**segment, "images": tuple(segment["images"])})})

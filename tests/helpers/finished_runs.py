@@ -32,10 +32,11 @@ from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.importers.image_folder import collection_from_scan, scan_image_folder
+from smust3r_colmap.importers.image_scan import RECORDS
 from smust3r_colmap.products import FusedScene, ImageCollection, PointCloud
 from smust3r_colmap.refinement.global_refinement import RefinedFigures, RefineTask, refine_scenes
 from smust3r_colmap.storage.depth_maps import DepthMapWriter, StoredDepthMaps
-from smust3r_colmap.storage.run_directory import DATABASE_FILE, MODEL_FOLDER, RunDirectory, key_of, write_json
+from smust3r_colmap.storage.run_directory import DATABASE_FILE, MODEL_FOLDER, RunDirectory, key_of
 from smust3r_colmap.storage.scenes import FUSED_SCENES
 
 CAMERA = Intrinsics(model="SIMPLE_RADIAL", width=320, height=240, params=(290.0, 160.0, 120.0, -0.03))
@@ -72,7 +73,7 @@ def make_finished_run(folder: Path) -> Example:
     with RunDirectory(folder / "run") as run:
         scan = scan_image_folder(images)
         with run.stage("import", key=key_of("import")).write() as stage:
-            write_json(stage / "records.json", [record.to_json() for record in scan.records])
+            RECORDS.write(stage, scan.records)
         collection = collection_from_scan(scan, ImportConfig())
         figures = refine_corner(run, collection, world, placed=range(NUM_PLACED))
         finished = _store(run, collection, world, images)

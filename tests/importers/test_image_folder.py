@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import io
-import json
 import os
 import random
 import shutil
@@ -23,7 +22,6 @@ from smust3r_colmap.errors import CollectionError, ConfigError, ImageError, Inpu
 from smust3r_colmap.geometry.arrays import UInt8Array
 from smust3r_colmap.importers import camera_prior, image_folder, images
 from smust3r_colmap.importers.image_folder import (
-    ImportRecord,
     check_masks_not_inside,
     check_output_not_inside,
     collection_from_scan,
@@ -31,6 +29,7 @@ from smust3r_colmap.importers.image_folder import (
     natural_key,
     scan_image_folder,
 )
+from smust3r_colmap.importers.image_scan import RECORDS
 from smust3r_colmap.importers.images import load_grey, load_rgb
 from smust3r_colmap.products import ImageCollection, SourceImage
 
@@ -613,8 +612,9 @@ def test_known_files_are_not_read_again_and_give_the_same_collection(
     write(folder / "a.jpg", 3, exif=exif(make="Canon", model="Canon EOS 5D Mark II", focal_mm=35))
     (folder / "bad.jpg").write_bytes(b"not an image")
     scan = scan_image_folder(folder)
-    stored = json.loads(json.dumps([record.to_json() for record in scan.records]))
-    known = {record.name: record for record in map(ImportRecord.from_json, stored)}
+    (folder.parent / "stored").mkdir()
+    RECORDS.write(folder.parent / "stored", scan.records)
+    known = {record.name: record for record in RECORDS.read(folder.parent / "stored")}
     read_bytes, reads = Path.read_bytes, []
 
     def counting(path: Path) -> bytes:

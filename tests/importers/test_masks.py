@@ -407,15 +407,13 @@ def test_a_folder_of_masks_that_is_gone_is_named_with_the_way_out(masked_run: tu
         (output.parent / "moved").rename(masks)
 
 
-def test_a_finished_run_that_does_not_know_its_masks_is_of_another_version(
-    masked_run: tuple[Path, str], tmp_path: Path
-) -> None:
+def test_a_finished_run_that_does_not_know_its_masks_is_damaged(masked_run: tuple[Path, str], tmp_path: Path) -> None:
     output, _ = masked_run
     finished = output / "work" / "finished.json"
     before = finished.read_text()
     finished.write_text(json.dumps({**json.loads(before), "masks": "masks"}))
     try:
-        with pytest.raises(RunDirectoryError, match="was written by another version; start the same"):
+        with pytest.raises(RunDirectoryError, match=r"finished\.json: is damaged .* start the same"):
             trainer_of(output, tmp_path)
     finally:
         finished.write_text(before)

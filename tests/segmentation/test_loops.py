@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,7 @@ from smust3r_colmap.segmentation.similarity import (
 )
 from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.segmentation.windows import plan_windows
+from smust3r_colmap.storage.codec import Codec
 
 Array = npt.NDArray[np.float32]
 DIMENSIONS = 512
@@ -373,9 +374,11 @@ def test_ends_that_touch_are_no_loop() -> None:
 
 # ------------------------------------------------------------------------------ storage
 @pytest.mark.parametrize("places", [straight(300) % 150, np.zeros(100), straight(5)])
-def test_plans_survive_json(places: npt.NDArray[np.float64]) -> None:
+def test_plans_survive_the_disk(places: npt.NDArray[np.float64], tmp_path: Path) -> None:
     found = plan(see(places))
-    assert LoopPlan.from_json(json.loads(json.dumps(found.to_json(), allow_nan=False))) == found
+    codec: Codec[LoopPlan] = Codec(LoopPlan, "plan")
+    codec.write(tmp_path, found)
+    assert codec.read(tmp_path) == found
 
 
 # ----------------------------------------------------------------------------- refusals
