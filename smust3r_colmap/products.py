@@ -234,7 +234,7 @@ class Submodel:
         images: (N,) indices into the collection, ascending, all registered.
         seg_from_cam: (N, 3, 4) rigid.
         intrinsics: one per image, at the original image size.
-        method: which rung of the ladder made it, in words.
+        method: the mapping strategy that made it, in words.
         reprojection_error_px: mean over the observations; NaN where the backbone has no features.
         tracks: feature tracks, where the backbone has them.
     """

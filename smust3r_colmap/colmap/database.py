@@ -22,8 +22,10 @@ from smust3r_colmap.geometry.arrays import FloatArray, Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import ImageCollection
 
-_PATIENCE_S = 30.0
-_PAUSE_S = 0.02
+PATIENCE_S = 30.0
+"""How long a database that is locked is waited for."""
+PAUSE_S = 0.02
+"""Between two attempts to open it."""
 
 
 def write_colmap_database(
@@ -70,26 +72,26 @@ def _two_view_geometry(matches: npt.NDArray[np.uint32], j_from_i: FloatArray | N
     return geometry
 
 
-def open_database(path: Path) -> pycolmap.Database:
+def open_database(path: Path, *, patience_s: float = PATIENCE_S) -> pycolmap.Database:
     """The run's database, which several processes may open at the same moment.
 
     pycolmap writes when it opens and does not wait for a lock: with two processes one opening in sixty
     fails with "database is locked". So it is tried again.
 
     Raises:
-        StorageError: it cannot be opened for ``_PATIENCE_S`` seconds, or is no database.
+        StorageError: it cannot be opened for ``patience_s``, or is no database.
     """
-    give_up_s = time.monotonic() + _PATIENCE_S
+    give_up_s = time.monotonic() + patience_s
     while True:
         try:
             return pycolmap.Database.open(path)
         except RuntimeError as error:
             if time.monotonic() > give_up_s:
                 raise StorageError(
-                    f"{path}: cannot be opened for {_PATIENCE_S:.0f} s ({error}); is it held by another process, or "
+                    f"{path}: cannot be opened for {patience_s:.0f} s ({error}); is it held by another process, or "
                     f"damaged? Delete {path.parent} or start with --overwrite"
                 ) from error
-            time.sleep(_PAUSE_S)
+            time.sleep(PAUSE_S)
 
 
 def create_database(path: Path, collection: ImageCollection) -> None:

@@ -10,9 +10,12 @@ import numpy as np
 import pycolmap
 import pytest
 from helpers.finished_runs import CAMERA, NAMES, NUM_PLACED, WITHOUT_FEATURES, Example
+from helpers.mapped_segments import NUM_IMAGES, synthetic_segment
 from helpers.tracked_scenes import make_collection, true_matches
 
-from smust3r_colmap.colmap.database import write_colmap_database
+from smust3r_colmap.colmap.database import open_database, write_colmap_database
+from smust3r_colmap.errors import StorageError
+from smust3r_colmap.execution.task_pool import TaskPool
 
 
 @pytest.fixture(scope="module")
@@ -127,3 +130,24 @@ def test_a_camera_that_nothing_was_adjusted_for_keeps_its_guess(tmp_path: Path, 
         (row, *_) = geometry.inlier_matches
         shown = [world.point_of[k][row[k]] for k in (0, 1)]
         assert shown[0] == shown[1] >= 0
+
+
+# ------------------------------------------------------------------------------- opening
+def open_many_times(path: Path) -> int:
+    for _ in range(100):
+        with open_database(path) as database:
+            found = int(database.num_images())
+    return found
+
+
+def test_processes_that_open_the_database_at_the_same_moment_wait_for_each_other(tmp_path: Path) -> None:
+    path = synthetic_segment(tmp_path).task.database
+    with TaskPool(workers=2) as pool:
+        results = list(pool.map(open_many_times, [path] * 2))
+    assert [result.value for result in results] == [NUM_IMAGES, NUM_IMAGES]
+
+
+def test_a_file_that_is_no_database_is_named(tmp_path: Path) -> None:
+    (tmp_path / "database.db").write_bytes(b"garbage" * 1000)
+    with pytest.raises(StorageError, match=r"database\.db: cannot be opened .* --overwrite"):
+        open_database(tmp_path / "database.db", patience_s=0.1)

@@ -25,7 +25,6 @@ from helpers.tracked_scenes import (
     wrong_matches,
 )
 
-from smust3r_colmap.errors import StorageError
 from smust3r_colmap.features import guided_verification as feature_matches
 from smust3r_colmap.features.guided_verification import (
     MIN_MATCHES,
@@ -221,10 +220,3 @@ def test_database_gives_keypoints_raw_and_verified_matches_by_image_index(world:
     assert set(few.keypoints) == {0, 3, 4}
     assert few.raw.keys() == {(0, 3), (3, 4)}
     assert few.verified.keys() == {(3, 4)}
-
-
-def test_a_file_that_is_no_database_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("smust3r_colmap.features.sift._PATIENCE_S", 0.0)
-    (tmp_path / "f.db").write_bytes(b"this is no database, whatever its name says" * 100)
-    with pytest.raises(StorageError, match=r"f\.db: cannot be opened.*damaged\? Delete .* or start with --overwrite"):
-        read_matched_features(tmp_path / "f.db", range(3))

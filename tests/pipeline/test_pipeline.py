@@ -425,7 +425,7 @@ def round_trip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_walk_that_comes_back_is_closed_and_a_run_without_loops_is_not(
     round_trip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(calibration, "PILOT_IMAGES", 30)  # three windows are pilots, four follow them
+    monkeypatch.setattr(calibration, "MIN_CALIBRATION_IMAGES", 30)  # three windows are self-calibrated, four follow
     summary = run(round_trip / "images", tmp_path / "out", ROUND)
     mapped, adjusted = (
         list((tmp_path / "out/work/segments").glob(f"*/{stage}")) for stage in ("mapping", "calibrated")
@@ -466,26 +466,26 @@ def freely_mapped(output: Path) -> list[str]:
     return sorted(path.parent.name for path in (output / "work/segments").glob("*/calibrated"))
 
 
-def test_all_windows_find_the_camera_where_the_pilots_do_not_agree(
+def test_all_windows_are_self_calibrated_where_the_first_disagree(
     round_trip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(calibration, "PILOT_IMAGES", 30)
-    monkeypatch.setattr(calibration, "MAX_FOCAL_UNCERTAINTY", 0.0)
+    monkeypatch.setattr(calibration, "MIN_CALIBRATION_IMAGES", 30)
+    monkeypatch.setattr(calibration, "MAX_FOCAL_UNCERTAINTY_RATIO", 0.0)
     summary = run(round_trip / "images", tmp_path / "out", replace(UNREFINED_ROUND, loop_closing=NO_LOOPS))
     assert freely_mapped(tmp_path / "out") == [f"{segment.index:04d}" for segment in summary.segments]
     assert len(summary.segments) == 7
 
 
-def test_segments_that_a_wrong_camera_does_not_fit_are_mapped_freely(
+def test_segments_that_a_wrong_camera_does_not_fit_are_self_calibrated(
     round_trip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As where three pilots agree by chance: held fixed, a focal length off by some percent folds a segment."""
+    """As where three segments agree by chance: a fixed focal length off by a few percent gives a wrong model."""
 
     def too_long(*args: Any, **kwargs: Any) -> dict[int, Intrinsics]:
         agreed = calibration.agree_on_cameras(*args, **kwargs)
         return {k: replace(one, params=(1.1 * one.focal_px, *one.params[1:])) for k, one in agreed.items()}
 
-    monkeypatch.setattr(calibration, "PILOT_IMAGES", 30)
+    monkeypatch.setattr(calibration, "MIN_CALIBRATION_IMAGES", 30)
     monkeypatch.setattr(backbone, "agree_on_cameras", too_long)
     summary = run(round_trip / "images", tmp_path / "out", replace(UNREFINED_ROUND, loop_closing=NO_LOOPS))
     again = {path.parent.name for path in (tmp_path / "out/work/segments").glob("*/mapping_free")}

@@ -1,11 +1,14 @@
-"""The classical backbone as the pipeline sees it: stages, their keys, and what they hand on."""
+"""The classical backbone: SIFT features, incremental mapping of every segment, plane-sweep depth.
+
+The stages, their keys and their results. The next module to read is ``start_pair``.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -16,15 +19,16 @@ from smust3r_colmap.backbones.base import BackboneContext, BackbonePlugin, Backb
 from smust3r_colmap.backbones.classical.calibration import (
     CalibrationTask,
     agree_on_cameras,
-    are_certain,
     calibrate_segment,
-    choose_pilots,
-    is_better,
-    misfits,
+    choose_calibration_segments,
+    find_worse_fits,
+    focal_lengths_agree,
+    self_calibration_is_better,
 )
 from smust3r_colmap.backbones.classical.dense import DepthTask, make_depth
-from smust3r_colmap.backbones.classical.mapping import METHOD_VERSION, MappedSegment, MappingTask, map_segment
+from smust3r_colmap.backbones.classical.mapping import METHOD_VERSION, MappedSegment, map_segment
 from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
+from smust3r_colmap.backbones.classical.strategies import MappingTask
 from smust3r_colmap.backbones.options import NoOptions
 from smust3r_colmap.colmap.database import open_database
 from smust3r_colmap.config import ClassicalConfig
@@ -61,16 +65,28 @@ class ClassicalBackbone:
         collection: the images of the run.
         config: settings of the backbone.
         run: where finished work is kept, and how tasks run.
+        features: extracts those of the run that no earlier start has extracted.
+        mapper: maps a segment, in a child process.
     """
 
     name = "classical"
     metric = False
     has_tracks = True
 
-    def __init__(self, collection: ImageCollection, config: ClassicalConfig, run: Run) -> None:
+    def __init__(
+        self,
+        collection: ImageCollection,
+        config: ClassicalConfig,
+        run: Run,
+        *,
+        features: Callable[[], RunFeatures],
+        mapper: Callable[[MappingTask], MappedSegment] = map_segment,
+    ) -> None:
         self.collection = collection
         self.config = config
         self.run = run
+        self._extract = features
+        self._mapper = mapper
 
     def describe(self) -> npt.NDArray[np.float32]:
         """VLAD of the SIFT features of every image; see ``Backbone``."""
@@ -93,7 +109,7 @@ class ClassicalBackbone:
     # ------------------------------------------------------------- once in the run
     @cached_property
     def _features(self) -> RunFeatures:
-        return features_of_run(self.run, self.collection, self.config)
+        return self._extract()
 
     def _match(self, segments: Sequence[Segment]) -> dict[int, tuple[Pair, ...]]:
         """The matched pairs by segment. Pairs that failed are in no key, so what comes later is not final either."""
@@ -112,18 +128,19 @@ class ClassicalBackbone:
 
     # --------------------------------------------------------------- every segment
     def _map(self, segments: Sequence[Segment], pairs: Mapping[int, tuple[Pair, ...]]) -> list[MappedSegment]:
-        """Map pilots freely, agree on the cameras, map the other segments with these, bring the pilots to them.
+        """Map the segments with one calibration for the run; see ``calibration``.
 
-        Windows alone have a say about the cameras, so a loop that is found later changes no window.
+        Only windows determine the cameras, so a loop that is found later changes no window.
         """
         tasks = {segment.index: self._mapping_task(segment, pairs[segment.index]) for segment in segments}
         if self.collection.calibrated:
             mapped = self._map_all("mapping", list(tasks.values()))
             return [mapped[segment.index] for segment in segments]
-        mapped = self._map_pilots([tasks[segment.index] for segment in segments if segment.kind == "window"])
+        windows = [tasks[segment.index] for segment in segments if segment.kind == "window"]
+        mapped = self._self_calibrated(windows)
         known = self._agreed_cameras(segments, mapped)
         rest = [
-            replace(tasks[segment.index], trusted=known[segment.kind])
+            replace(tasks[segment.index], known_cameras=known[segment.kind])
             for segment in segments
             if segment.index not in mapped
         ]
@@ -141,7 +158,7 @@ class ClassicalBackbone:
             CalibrationTask(
                 mapping=tasks[segment.index],
                 mapped=free[segment.index],
-                agreed={**agreed[segment.kind], **tasks[segment.index].trusted},
+                agreed={**agreed[segment.kind], **tasks[segment.index].known_cameras},
             )
             for segment in segments
             if segment.index in free
@@ -149,49 +166,48 @@ class ClassicalBackbone:
         mapped |= self._calibrate_all(calibrations)
         return [mapped[segment.index] for segment in segments]
 
-    def _map_pilots(self, windows: Sequence[MappingTask]) -> dict[int, MappedSegment]:
-        """Freely mapped windows, by segment: a few where these agree on the cameras, otherwise all."""
-        pilots = choose_pilots(windows)
-        mapped = self._map_all("mapping", pilots)
+    def _self_calibrated(self, windows: Sequence[MappingTask]) -> dict[int, MappedSegment]:
+        """Windows mapped with free cameras, by segment: the calibration segments, or all where these disagree."""
+        mapped = self._map_all("mapping", choose_calibration_segments(windows))
         rest = [task for task in windows if task.segment not in mapped]
         cameras = {camera for task in rest for camera in task.camera_indices}
-        if not are_certain(cameras, list(mapped.values()), [image.camera for image in self.collection.images]):
+        if not focal_lengths_agree(cameras, list(mapped.values()), [image.camera for image in self.collection.images]):
             mapped |= self._map_all("mapping of more windows", rest)
         return mapped
 
     def _map_known(
-        self, tasks: Sequence[MappingTask], pilots: Sequence[MappedSegment]
+        self, tasks: Sequence[MappingTask], calibration: Sequence[MappedSegment]
     ) -> list[tuple[MappingTask, MappedSegment]]:
-        """Segments mapped with the cameras found, but freely where these do not fit; each with the task that stands."""
+        """Segments mapped with the cameras found, or with free ones where these fit better; each with its task."""
         mapped = self._map_all("mapping with the cameras found", tasks)
         chosen = {task.segment: (task, mapped[task.segment]) for task in tasks}
-        doubtful = misfits(list(mapped.values()), pilots)
-        if doubtful:
-            again = [replace(task, trusted={}) for task in tasks if task.segment in doubtful]
-            freely = self._map_all("mapping where these do not fit", again, folder="mapping_free")
+        worse = find_worse_fits(list(mapped.values()), calibration)
+        if worse:
+            again = [replace(task, known_cameras={}) for task in tasks if task.segment in worse]
+            free = self._map_all("mapping where these do not fit", again, folder="mapping_free")
             for task in again:
-                if is_better(freely[task.segment], mapped[task.segment]):
-                    chosen[task.segment] = (task, freely[task.segment])
+                if self_calibration_is_better(free[task.segment], mapped[task.segment]):
+                    chosen[task.segment] = (task, free[task.segment])
         return list(chosen.values())
 
     def _map_all(self, name: str, tasks: Sequence[MappingTask], *, folder: str = "mapping") -> dict[int, MappedSegment]:
-        """What the mappers make of segments, by segment; where they bring the process down, without the global one."""
+        """Mapped segments by index; without the global mapper where a mapper aborted the process."""
         folders = [self._segment_stage(task.segment, folder, self._mapping_key(task)) for task in tasks]
         with self.run.clock.stage(name, total=len(tasks)) as stage:
-            mapped = self._finish(map_segment, tasks, folders, [_nothing(task) for task in tasks], stage)
+            mapped = self._finish(self._mapper, tasks, folders, [_nothing(task) for task in tasks], stage)
         crashed = [k for k, one in enumerate(mapped) if not one.models and not folders[k].is_done]
         if crashed:
             with self.run.clock.stage("mapping without the global mapper", total=len(crashed)) as stage:
                 careful = [replace(tasks[k], use_global=False) for k in crashed]
                 again = self._finish(
-                    map_segment, careful, [folders[k] for k in crashed], [mapped[k] for k in crashed], stage
+                    self._mapper, careful, [folders[k] for k in crashed], [mapped[k] for k in crashed], stage
                 )
             for k, one in zip(crashed, again, strict=True):
                 mapped[k] = one
         return {one.segment: one for one in mapped}
 
     def _calibrate_all(self, tasks: Sequence[CalibrationTask]) -> dict[int, MappedSegment]:
-        """Freely mapped segments brought to the agreed cameras, by segment."""
+        """Self-calibrated segments adjusted to the agreed cameras, by segment."""
         keys = [key_of("calibrated", self._mapping_key(task.mapping), sorted(task.agreed.items())) for task in tasks]
         folders = [
             self._segment_stage(task.mapping.segment, "calibrated", key) for task, key in zip(tasks, keys, strict=True)
@@ -201,15 +217,15 @@ class ClassicalBackbone:
         return {one.segment: one for one in calibrated}
 
     def _mapping_key(self, task: MappingTask) -> str:
-        inputs = (self._features.key, self.run.seed, task.images, task.pairs, sorted(task.trusted.items()))
+        inputs = (self._features.key, self.run.seed, task.images, task.pairs, sorted(task.known_cameras.items()))
         return key_of("mapping", METHOD_VERSION, *inputs)
 
     def _agreed_cameras(
         self, segments: Sequence[Segment], free: Mapping[int, MappedSegment]
     ) -> dict[SegmentKind, dict[int, Intrinsics]]:
-        """The cameras that freely mapped windows agree on, by the kind of segment that may take them over.
+        """The cameras of self-calibrated windows, by the kind of segment that may use them.
 
-        What one window alone has seen is agreed as far as that window goes, not for the loops that meet it.
+        A camera of one window alone is not used for other windows, but for the loops with this window.
         """
         windows = [free[segment.index] for segment in segments if segment.kind == "window" and segment.index in free]
         camera_of_image = [image.camera for image in self.collection.images]
@@ -227,7 +243,7 @@ class ClassicalBackbone:
             camera_indices=tuple(self.collection.images[i].camera for i in segment.images),
             pairs=pairs,
             cameras=self.collection.cameras,
-            trusted=dict(enumerate(self.collection.cameras)) if self.collection.calibrated else {},
+            known_cameras=dict(enumerate(self.collection.cameras)) if self.collection.calibrated else {},
             seed=self.run.seed,
         )
 
@@ -239,10 +255,10 @@ class ClassicalBackbone:
         otherwise: Sequence[MappedSegment],
         stage: Stage,
     ) -> list[MappedSegment]:
-        """Run what no earlier start finished, store it, and return everything in order.
+        """Run and store what no earlier run finished, and return all results in order.
 
-        A task that failed gives what ``otherwise`` has for it, which is not stored: the next start, with
-        fewer workers or more disk, may get farther.
+        A task that failed gives its entry of ``otherwise``, which is not stored: the next run, with fewer workers or
+        more disk, may succeed.
         """
         missing = [k for k, folder in enumerate(folders) if not folder.is_done]
         stage.skip(len(tasks) - len(missing))
@@ -353,11 +369,8 @@ def _read_matches(database: Path, pairs: Sequence[Pair]) -> InterSegmentMatches:
 
 def make_classical(context: BackboneContext, options: NoOptions) -> ClassicalBackbone:
     """The classical backbone of one run."""
-    return ClassicalBackbone(
-        context.collection,
-        context.config.classical,
-        context.run,
-    )
+    run, collection, settings = context.run, context.collection, context.config.classical
+    return ClassicalBackbone(collection, settings, run, features=partial(features_of_run, run, collection, settings))
 
 
 CLASSICAL = BackbonePlugin(make=make_classical, options=NoOptions)

@@ -1,20 +1,18 @@
 """One calibration for the whole run.
 
-Self-calibration inside a short segment is weak: focal lengths of neighbouring segments differ by
-some percent, and now and then one diverges (853 px for 525). Segments whose cameras differ do not
-fit together by any similarity. So the run agrees on one set of intrinsics per camera: a few windows,
-the pilots, are mapped freely, and every other segment with the median of what they found. Where the
-pilots do not agree, all windows are mapped freely, and so is a segment whose pixels do not fit the
-cameras found: a focal length that is off by two percent can fold a segment with little parallax. Then
-freely mapped models are adjusted to the median; one that had diverged is mapped again under it.
+Self-calibration of a short segment is weak: focal lengths of neighbouring segments differ by a few percent, and some
+diverge (853 px instead of 525). No similarity aligns segments with different cameras. So the run has one set of
+intrinsics per camera: a few windows, the calibration segments, are self-calibrated, and all other segments are mapped
+with the median of their cameras. If the calibration segments disagree, all windows are self-calibrated, and so is a
+segment with a much larger reprojection error: with little parallax, a focal length that is off by two percent can give
+a wrong model. Then self-calibrated models are adjusted to the median; diverged ones are mapped again with it.
 The next module to read is ``dense``.
 """
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,26 +20,27 @@ import numpy.typing as npt
 import pycolmap
 
 from smust3r_colmap.backbones.classical.mapped_model import MappedModel, model_from_reconstruction, placed_images
-from smust3r_colmap.backbones.classical.mapping import ENOUGH_REGISTERED, MappedSegment, MappingTask, map_segment
+from smust3r_colmap.backbones.classical.mapping import ENOUGH_REGISTERED_SHARE, MappedSegment, map_segment
 from smust3r_colmap.backbones.classical.model_checks import FOCAL_TOLERANCE, diverged_focal
+from smust3r_colmap.backbones.classical.strategies import MappingTask
 from smust3r_colmap.colmap.database import internal_name, open_database
 from smust3r_colmap.estimators.robust import mad_sigma, weighted_median
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import UnregisteredImage
 
-logger = logging.getLogger(__name__)
-
-MAX_ERROR_GROWTH, ERROR_SLACK_PX = 1.25, 0.05
-"""A model that fits the agreed cameras worse than this keeps its own."""
-PILOTS = 3
-"""Windows, at least, that a camera's parameters are found in: one may be wrong."""
-PILOT_IMAGES = 150
-"""Images of a camera in them: three windows of the usual length, more where windows are short and each knows less."""
-MAX_FOCAL_UNCERTAINTY = 0.02
-"""Relative standard error of the median of the pilots' focal lengths, above which they do not agree."""
-MIN_PILOT_SHARE = 1 / 3
-"""Share of a window's images that have to be of a camera if the window is to tell of it."""
+MAX_ERROR_GROWTH_RATIO, ERROR_SLACK_PX = 1.25, 0.05
+"""Growth of the mean reprojection error, as a ratio and in pixels, above which a model keeps its own cameras."""
+MIN_KEPT_POINTS_SHARE = 0.7
+"""Share of its points below which an adjusted model is discarded."""
+MIN_CALIBRATION_SEGMENTS = 3
+"""Windows that determine a camera; one of them may be wrong."""
+MIN_CALIBRATION_IMAGES = 150
+"""Images of a camera in them: three windows of the usual length, more of them where windows are shorter."""
+MAX_FOCAL_UNCERTAINTY_RATIO = 0.02
+"""Relative standard error of the median focal length above which calibration segments disagree."""
+MIN_CAMERA_SHARE = 1 / 3
+"""Share of a window's images that have to be of a camera for the window to count for it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +49,7 @@ class CalibrationTask:
 
     Args:
         mapping: the task that made it. mapped: its result.
-        agreed: intrinsics by camera index, for the cameras that have been agreed on.
+        agreed: the run's intrinsics by camera index, for the cameras that have any.
     """
 
     mapping: MappingTask
@@ -58,40 +57,44 @@ class CalibrationTask:
     agreed: Mapping[int, Intrinsics]
 
 
-def choose_pilots(windows: Sequence[MappingTask]) -> list[MappingTask]:
-    """The windows to map with free cameras, before the others take over what these agree on.
+def choose_calibration_segments(windows: Sequence[MappingTask]) -> list[MappingTask]:
+    """The windows to self-calibrate, before the others are mapped with the cameras found.
 
-    A mapper that knows the camera needs half of the time, for most of its steps go along the valley in
-    which focal length and distortion make up for each other, and it does not diverge. Windows that
-    share no images come first; they are the first of the collection, so that images appended to it
-    change nothing. Windows of a camera that too few others show are all pilots.
+    With known cameras a mapper takes half of the time and does not diverge: focal length and distortion are nearly
+    degenerate, which makes bundle adjustment converge slowly. Windows that share no images come first; they are the
+    first of the collection, so that images appended to it change nothing. All windows of a rare camera are chosen.
     """
     num_windows: Counter[int] = Counter()
     num_images: Counter[int] = Counter()
-    pilots = []
+    chosen = []
     for task in [*windows[::2], *windows[1::2]]:
         seen = Counter(task.camera_indices)
-        if all(num_windows[camera] >= PILOTS and num_images[camera] >= PILOT_IMAGES for camera in seen):
+        if all(
+            num_windows[camera] >= MIN_CALIBRATION_SEGMENTS and num_images[camera] >= MIN_CALIBRATION_IMAGES
+            for camera in seen
+        ):
             continue
-        pilots.append(task)
+        chosen.append(task)
         for camera, count in seen.items():
-            if count >= MIN_PILOT_SHARE * len(task.images):
+            if count >= MIN_CAMERA_SHARE * len(task.images):
                 num_windows[camera] += 1
                 num_images[camera] += count
-    return pilots
+    return chosen
 
 
-def are_certain(cameras: Collection[int], pilots: Sequence[MappedSegment], camera_of_image: Sequence[int]) -> bool:
-    """The pilots' focal lengths scatter so little that their median can be relied on for these cameras.
+def focal_lengths_agree(
+    cameras: Collection[int], segments: Sequence[MappedSegment], camera_of_image: Sequence[int]
+) -> bool:
+    """Whether the median focal length of the calibration segments is certain enough for all of these cameras.
 
-    Of a camera that one model alone has seen nothing is certain.
+    That of a camera in only one model is not.
     """
     log_focal: dict[int, list[float]] = {camera: [] for camera in cameras}
-    for model in (model for pilot in pilots for model in pilot.models):
+    for model in (model for segment in segments for model in segment.models):
         for camera, intrinsics in _cameras_of(model, camera_of_image).items():
             log_focal.setdefault(camera, []).append(float(np.log(intrinsics.focal_px)))
     return all(
-        len(log_focal[camera]) > 1 and _median_uncertainty(np.array(log_focal[camera])) <= MAX_FOCAL_UNCERTAINTY
+        len(log_focal[camera]) > 1 and _median_uncertainty(np.array(log_focal[camera])) <= MAX_FOCAL_UNCERTAINTY_RATIO
         for camera in cameras
     )
 
@@ -105,19 +108,22 @@ def _cameras_of(model: MappedModel, camera_of_image: Sequence[int]) -> dict[int,
     return {camera_of_image[image]: one for image, one in zip(model.images, model.intrinsics, strict=True)}
 
 
-def misfits(with_known: Sequence[MappedSegment], pilots: Sequence[MappedSegment]) -> list[int]:
-    """Segments, of those mapped with the cameras found, whose pixels are clearly worse off than the pilots'."""
-    usual = [mean_error_px(pilot) for pilot in pilots if pilot.models]
-    return [one.segment for one in with_known if one.models and usual and fits_worse(one, float(np.median(usual)))]
+def find_worse_fits(with_known: Sequence[MappedSegment], calibration: Sequence[MappedSegment]) -> list[int]:
+    """Segments mapped with known cameras whose reprojection error is much larger than the calibration segments'."""
+    errors_px = [mean_error_px(one) for one in calibration if one.models]
+    if not errors_px:
+        return []
+    typical_px = float(np.median(errors_px))
+    return [one.segment for one in with_known if one.models and fits_worse(one, typical_px)]
 
 
 def fits_worse(mapped: MappedSegment, error_px: float) -> bool:
-    """Its mean reprojection error has grown beyond ``error_px`` by more than chance explains."""
-    return not mean_error_px(mapped) < MAX_ERROR_GROWTH * error_px + ERROR_SLACK_PX
+    """Whether its mean reprojection error is larger than ``error_px`` by more than chance explains."""
+    return not mean_error_px(mapped) < MAX_ERROR_GROWTH_RATIO * error_px + ERROR_SLACK_PX
 
 
-def is_better(free: MappedSegment, known: MappedSegment) -> bool:
-    """A segment is better mapped freely: no image is lost, and its pixels fit clearly better."""
+def self_calibration_is_better(free: MappedSegment, known: MappedSegment) -> bool:
+    """Whether a segment mapped with free cameras loses no image and has a clearly smaller reprojection error."""
     no_fewer = len(placed_images(free.models)) >= len(placed_images(known.models))
     return bool(free.models) and no_fewer and fits_worse(known, mean_error_px(free))
 
@@ -137,10 +143,8 @@ def agree_on_cameras(
 ) -> dict[int, Intrinsics]:
     """Weighted median of each parameter over the models, by camera index.
 
-    A model counts as many times as it has images of the camera and observations per image allow:
-    weight is images of the camera times the square root of its points. Diverged focal lengths do not
-    count. Cameras that fewer than ``min_models`` models have seen are left out: one model alone agrees
-    with itself.
+    A model's weight is its images of the camera times the square root of its points. Diverged focal lengths do not
+    count. Cameras of fewer than ``min_models`` models are left out.
     """
     seen: dict[int, list[tuple[float, Intrinsics]]] = {}
     for segment in segments:
@@ -164,22 +168,25 @@ def _median_params(weights: Sequence[float], intrinsics: Sequence[Intrinsics]) -
     return tuple(weighted_median(column, weight[chosen]) for column in values.T)
 
 
-def calibrate_segment(task: CalibrationTask) -> MappedSegment:
-    """Map again what diverged, then adjust every model with the agreed cameras held fixed.
+def calibrate_segment(
+    task: CalibrationTask, *, map_again: Callable[[MappingTask], MappedSegment] = map_segment
+) -> MappedSegment:
+    """Map again if cameras diverged, then adjust every model with the agreed cameras held fixed.
 
-    The new models replace all old ones, unless they place fewer images than the sound ones among the old.
+    The new models replace all old ones, unless they register fewer images than the old ones that had not diverged.
     """
     mapped = task.mapped
     camera_of = task.mapping.camera_of
     sound = [model for model in mapped.models if not diverged_focal(model, camera_of, task.agreed)]
     placed = placed_images(sound)
-    if len(placed) >= ENOUGH_REGISTERED * len(task.mapping.images):
-        mapped = replace(mapped, models=tuple(sound), unregistered=left_over(task.mapping, sound, mapped.unregistered))
+    if len(placed) >= ENOUGH_REGISTERED_SHARE * len(task.mapping.images):
+        left = unregistered_images(task.mapping, sound, mapped.unregistered)
+        mapped = replace(mapped, models=tuple(sound), unregistered=left)
     elif len(sound) < len(mapped.models):
-        again = map_segment(replace(task.mapping, trusted=task.agreed))
-        attempts = (*mapped.attempts, "focal length off the run's: mapped again", *again.attempts)
+        again = map_again(replace(task.mapping, known_cameras=task.agreed))
+        attempts = (*mapped.attempts, "focal length differs from the run's: mapped again", *again.attempts)
         if len(placed_images(again.models)) < len(placed):
-            left = left_over(task.mapping, sound, again.unregistered)
+            left = unregistered_images(task.mapping, sound, again.unregistered)
             again = replace(again, models=tuple(sound), unregistered=left)
         mapped = replace(again, attempts=attempts)
     models = []
@@ -191,10 +198,10 @@ def calibrate_segment(task: CalibrationTask) -> MappedSegment:
     return replace(mapped, models=tuple(models), attempts=(*mapped.attempts, *notes))
 
 
-def left_over(
+def unregistered_images(
     task: MappingTask, models: Sequence[MappedModel], known: Sequence[UnregisteredImage]
 ) -> tuple[UnregisteredImage, ...]:
-    """Images of the segment in none of ``models``, with the reason where one is known already."""
+    """Images of the segment in none of ``models``, with the known reasons."""
     placed = placed_images(models)
     reasons = {one.image: one.reason for one in known}
     return tuple(
@@ -205,7 +212,7 @@ def left_over(
 
 
 def _adjust(model: MappedModel, task: CalibrationTask) -> tuple[MappedModel, str]:
-    """Bundle adjustment under the agreed cameras, kept unless it fits clearly worse."""
+    """Bundle adjustment with the agreed cameras, kept unless it fits clearly worse."""
     reconstruction = reconstruction_from_model(model, task)
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
@@ -221,9 +228,9 @@ def _adjust(model: MappedModel, task: CalibrationTask) -> tuple[MappedModel, str
     reconstruction.update_point_3d_errors()
     adjusted = model_from_reconstruction(reconstruction, model.method)
     before, after = model.reprojection_error_px, adjusted.reprojection_error_px
-    worse = len(adjusted.images) < len(model.images) or not after < MAX_ERROR_GROWTH * before + ERROR_SLACK_PX
+    worse = len(adjusted.images) < len(model.images) or not after < MAX_ERROR_GROWTH_RATIO * before + ERROR_SLACK_PX
     kept_points = len(adjusted.tracks.points_seg) / max(len(model.tracks.points_seg), 1)
-    if worse or kept_points < 0.7:
+    if worse or kept_points < MIN_KEPT_POINTS_SHARE:
         return (
             model,
             f"{len(model.images)} images keep their own focal length ({before:.2f} px, agreed one {after:.2f} px)",

@@ -1,7 +1,7 @@
-"""What tells a wrong model from a right one. By its own pixels a wrong one looks perfect.
+"""Checks of a mapped model by its pairs of images: a wrong model may have a small reprojection error.
 
-Each check gives its finding in words, or the positions in the model at which it breaks.
-The next module to read is ``mapping``, which climbs from one mapper to the next until the checks pass.
+Each check gives a reason in words, or the positions in the model at which it fails.
+The next module to read is ``strategies``.
 """
 
 from __future__ import annotations
@@ -19,70 +19,70 @@ from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 
 MAX_TURN_DEG = 60.0
-"""Neighbouring images that match cannot have turned by more (honest walks: 52 at most; folds: 150)."""
+"""Largest rotation between consecutive images that match (correct walks: 52 at most; wrong models: 150)."""
 MAX_STEP_RATIO = 10.0
-"""Nor moved by more than this many median steps (honest walks: 1.8; folds: 33 to 42) ..."""
-MIN_JUMP_DEPTHS = 0.5
-"""... unless the step is small beside the distance of what they see, as after a pause."""
+"""Largest step between them, in median steps (correct walks: 1.8; wrong models: 33 to 42) ..."""
+MIN_STEP_DEPTH_RATIO = 0.5
+"""... unless the step is smaller than this share of the depth of what they see, as after a pause."""
 STRONG_PAIR_INLIERS = 30
-"""Verified matches that make two images certain neighbours (COLMAP's own bar for registration)."""
-MIN_EXPLAINED_SHARE = 0.5
-"""A relative pose that fewer of the pair's verified matches agree with is wrong (sound models: 0.57 at
+"""Verified matches of a pair that is checked (COLMAP's own bar for registration)."""
+MIN_EPIPOLAR_INLIER_SHARE = 0.5
+"""Share of a pair's verified matches that must be inliers of its relative pose (correct models: 0.57 at
 least; wrong ones, on a walk round a building: 0 to 0.44)."""
-AFFIRMED_SHARE = 0.8
-"""A turn that so many of the pair's verified matches agree with has happened, as at the end of a drone's strip."""
+CONFIRMED_TURN_SHARE = 0.8
+"""Share of such inliers that confirms a large rotation, as at the end of a drone's strip."""
 MAX_EPIPOLAR_ERROR_PX = 4.0
 """COLMAP's own bound for an inlier of two views."""
 NEAR_STEPS = 2
-"""How far apart in the sequence two images may be to deny each other; farther ones may be look-alikes."""
-MIN_HINGE_POINTS = 12
-"""Common points that hold two halves of a model together (honest links: 16 at least; a wrong one: 9)."""
+"""Largest difference of the indices of a pair that is tested; images farther apart may show two similar places."""
+MIN_LINK_POINTS = 12
+"""Common points that connect two halves of a model (correct links: 16 at least; a wrong one: 9)."""
 MIN_FOCAL_RATIO, MAX_FOCAL_RATIO = 0.2, 8.0
-"""Focal length over the longer side, from a 136 degree lens to a 7 degree one; a few images in a row
-on nearly parallel rays self-calibrate to anything."""
+"""Focal length over the longer side, from a 136 degree lens to a 7 degree one; the self-calibration of a few images
+with nearly parallel rays may diverge to any value."""
 FOCAL_TOLERANCE = 0.15
-"""A focal length farther from the run's median belongs to a diverged self-calibration."""
+"""Relative difference from the run's median above which a self-calibration has diverged."""
 
 
-def absurd_focal(model: MappedModel) -> str:
-    """What is wrong with the focal lengths of most images, or nothing."""
+def implausible_focal(model: MappedModel) -> str:
+    """Why the focal lengths of most images are implausible, or nothing."""
     ratios = np.array([one.focal_px / max(one.width, one.height) for one in model.intrinsics])
-    absurd = (ratios < MIN_FOCAL_RATIO) | (ratios > MAX_FOCAL_RATIO)
-    if absurd.mean() <= 0.5:
+    implausible = (ratios < MIN_FOCAL_RATIO) | (ratios > MAX_FOCAL_RATIO)
+    if implausible.mean() <= 0.5:
         return ""
-    k = int(np.argmax(absurd))
+    k = int(np.argmax(implausible))
     return f"focal length {model.intrinsics[k].focal_px:.0f} px is {ratios[k]:.1f} times the longer side"
 
 
-def diverged_focal(model: MappedModel, camera_of: Mapping[int, int], trusted: Mapping[int, Intrinsics]) -> str:
+def diverged_focal(model: MappedModel, camera_of: Mapping[int, int], known_cameras: Mapping[int, Intrinsics]) -> str:
     """How far the focal lengths of most images are from the run's, or nothing.
 
     Args:
-        camera_of: camera index by image. trusted: the run's cameras, by index; may lack some.
+        camera_of: camera index by image. known_cameras: the run's, by index; some may be missing.
     """
-    known_focal = {camera: intrinsics.focal_px for camera, intrinsics in trusted.items()}
+    known_focal = {camera: intrinsics.focal_px for camera, intrinsics in known_cameras.items()}
     known = np.array([known_focal.get(camera_of[image], np.nan) for image in model.images])
     focal = np.array([one.focal_px for one in model.intrinsics])
-    diverged = np.abs(np.log(focal / known)) > np.log1p(FOCAL_TOLERANCE)  # False where the run has none
+    diverged = np.abs(np.log(focal / known)) > np.log1p(FOCAL_TOLERANCE)  # False where none is known
     if diverged.mean() <= 0.5:
         return ""
     k = int(np.argmax(diverged))
     return f"focal length {focal[k]:.0f} px, the run's is {known[k]:.0f} px"
 
 
-def find_jumps(model: MappedModel, inliers: Mapping[Pair, int]) -> list[int]:
-    """Positions k where ``model.images[k]`` and the next image of the sequence match but stand apart.
+def find_inconsistent_poses(model: MappedModel, inliers: Mapping[Pair, int]) -> list[int]:
+    """Positions k where ``model.images[k]`` and the next image of the sequence match but are posed far apart.
 
-    A pair counts when its numbers are consecutive and it has STRONG_PAIR_INLIERS verified matches;
-    standing apart is a turn above MAX_TURN_DEG, or a step above MAX_STEP_RATIO median steps and
-    above MIN_JUMP_DEPTHS of the distance of what the first image sees.
+    A pair is tested if its images are consecutive and it has STRONG_PAIR_INLIERS verified matches. It is far apart
+    with a rotation above MAX_TURN_DEG, or with a step above MAX_STEP_RATIO median steps and above MIN_STEP_DEPTH_RATIO
+    of the median depth of what the first image sees.
     """
     lengths = _step_lengths(model, inliers)
     return [k for k in lengths if _turn_deg(model, k) > MAX_TURN_DEG or _is_too_far(model, k, lengths)]
 
 
 def _step_lengths(model: MappedModel, inliers: Mapping[Pair, int]) -> dict[int, float]:
-    """How far the camera moved after position k, for every k whose image and the next are certain neighbours."""
+    """How far the camera moved after position k, for every k whose image and the next are a tested pair."""
     centres = model.seg_from_cam[:, :, 3]
     return {
         k: float(np.linalg.norm(centres[k + 1] - centres[k]))
@@ -98,13 +98,13 @@ def _turn_deg(model: MappedModel, k: int) -> float:
 
 def _is_too_far(model: MappedModel, k: int, lengths: Mapping[int, float]) -> bool:
     median = float(np.median(list(lengths.values())))
-    return lengths[k] > MAX_STEP_RATIO * median and lengths[k] > MIN_JUMP_DEPTHS * _median_depth(model, k)
+    return lengths[k] > MAX_STEP_RATIO * median and lengths[k] > MIN_STEP_DEPTH_RATIO * _median_depth(model, k)
 
 
-def find_doubtful_jumps(model: MappedModel, inliers: Mapping[Pair, int], database: pycolmap.Database) -> list[int]:
-    """The jumps but for turns that AFFIRMED_SHARE of the verified matches agree with.
+def find_unconfirmed_poses(model: MappedModel, inliers: Mapping[Pair, int], database: pycolmap.Database) -> list[int]:
+    """The inconsistent poses without rotations that CONFIRMED_TURN_SHARE of the verified matches confirm.
 
-    Matches say nothing about the length of a step, so one that is too long stays in doubt.
+    Epipolar errors do not depend on the length of a step, so they cannot confirm a long one.
 
     Args:
         inliers: verified matches by pair. database: with the keypoints and the two-view geometries.
@@ -112,8 +112,8 @@ def find_doubtful_jumps(model: MappedModel, inliers: Mapping[Pair, int], databas
     lengths = _step_lengths(model, inliers)
     return [
         k
-        for k in find_jumps(model, inliers)
-        if _is_too_far(model, k, lengths) or explained_share(model, k, k + 1, database) < AFFIRMED_SHARE
+        for k in find_inconsistent_poses(model, inliers)
+        if _is_too_far(model, k, lengths) or epipolar_inlier_share(model, k, k + 1, database) < CONFIRMED_TURN_SHARE
     ]
 
 
@@ -125,10 +125,10 @@ def _median_depth(model: MappedModel, k: int) -> float:
     return float(np.median(model.tracks.points_seg[seen] @ cam_from_seg[2, :3] + cam_from_seg[2, 3]))
 
 
-def find_hinges(model: MappedModel) -> list[int]:
-    """Positions k such that fewer than MIN_HINGE_POINTS points are seen on both sides of image k and the next.
+def find_weak_links(model: MappedModel) -> list[int]:
+    """Positions k such that fewer than MIN_LINK_POINTS points are seen both up to image k and after it.
 
-    The two sides may turn and grow against each other about so few points, however well they fit.
+    So few points hardly determine the relative rotation and scale of the two sides.
     """
     tracks = model.tracks
     position = np.searchsorted(model.images, tracks.image_of_observation)
@@ -136,25 +136,25 @@ def find_hinges(model: MappedModel) -> list[int]:
     first, last = np.full(num_points, len(model.images)), np.full(num_points, -1)
     np.minimum.at(first, tracks.point_of_observation, position)
     np.maximum.at(last, tracks.point_of_observation, position)
-    return [k for k in range(len(model.images) - 1) if np.count_nonzero((first <= k) & (last > k)) < MIN_HINGE_POINTS]
+    return [k for k in range(len(model.images) - 1) if np.count_nonzero((first <= k) & (last > k)) < MIN_LINK_POINTS]
 
 
-def find_denied_steps(model: MappedModel, inliers: Mapping[Pair, int], database: pycolmap.Database) -> list[int]:
-    """Positions k such that verified matches deny how the model places image k and the next.
+def find_epipolar_outliers(model: MappedModel, inliers: Mapping[Pair, int], database: pycolmap.Database) -> list[int]:
+    """Positions k such that the poses of image k and the next contradict verified matches.
 
-    Every pair of near images with STRONG_PAIR_INLIERS has to find most of its matches on their epipolar
-    lines. That tells a fold, or a bad bridge, from a drone's half turn at the end of a strip, where the
-    model turns as well but the matches agree. Images from the two ends of a loop are never near.
+    Of every pair of near images with STRONG_PAIR_INLIERS, most matches have to lie near their epipolar lines. That
+    tells a wrong model from a drone's half turn at the end of a strip, where the rotation is large but the matches
+    agree. Images from the two ends of a loop are never near.
 
     Args:
         inliers: verified matches by pair. database: with the keypoints and the two-view geometries.
     """
-    denied = set()
+    outliers = set()
     for a, b in near_positions(model.images):
         strong = inliers.get((model.images[a], model.images[b]), 0) >= STRONG_PAIR_INLIERS
-        if strong and explained_share(model, a, b, database) < MIN_EXPLAINED_SHARE:
-            denied.add(b - 1)
-    return sorted(denied)
+        if strong and epipolar_inlier_share(model, a, b, database) < MIN_EPIPOLAR_INLIER_SHARE:
+            outliers.add(b - 1)
+    return sorted(outliers)
 
 
 def near_positions(images: Sequence[int]) -> Iterator[tuple[int, int]]:
@@ -165,8 +165,8 @@ def near_positions(images: Sequence[int]) -> Iterator[tuple[int, int]]:
                 yield a, b
 
 
-def explained_share(model: MappedModel, a: int, b: int, database: pycolmap.Database) -> float:
-    """Share of the verified matches of the images at positions a and b that fit the model's relative pose."""
+def epipolar_inlier_share(model: MappedModel, a: int, b: int, database: pycolmap.Database) -> float:
+    """Share of the verified matches of the images at positions a and b that are inliers of the relative pose."""
     first, second = model.images[a] + 1, model.images[b] + 1
     matches = database.read_two_view_geometry(first, second).inlier_matches
     xy_first = np.asarray(database.read_keypoints(first), dtype=np.float64)[matches[:, 0], :2]
