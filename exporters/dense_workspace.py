@@ -31,13 +31,13 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 import pycolmap
-from PIL import ExifTags, Image
+from PIL import Image
 
 from smust3r_colmap.dense.depth_consistency import ModelDepth, depth_of_model
 from smust3r_colmap.errors import ImageError, InputError, ReconstructionError, StorageError
 from smust3r_colmap.execution.task_pool import TaskFailure, in_child, usable_cores
 from smust3r_colmap.geometry.arrays import FloatArray
-from smust3r_colmap.importers.images import inspect, load_rgb
+from smust3r_colmap.importers.images import inspect, load_rgb, stored_orientation
 from smust3r_colmap.products import DepthMaps, SourceImage
 from smust3r_colmap.storage.atomic_write import atomic_folder
 
@@ -218,7 +218,7 @@ def _look_at(images: Path, model: pycolmap.Reconstruction, image_id: int) -> _So
 def _is_turned(data: bytes) -> bool:
     """EXIF says that the pixels are stored turned or mirrored, which COLMAP does not look at."""
     with Image.open(io.BytesIO(data)) as head:
-        return head.getexif().get(ExifTags.Base.Orientation, 1) not in (0, 1)
+        return stored_orientation(head) != 1
 
 
 def _longer_side(model: pycolmap.Reconstruction, maps: DepthMaps) -> int:

@@ -6,7 +6,6 @@ stand, says which of it belongs together. The next module to read is ``exports``
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +19,7 @@ from smust3r_colmap.importers.masks import MaskSet, check_masks
 from smust3r_colmap.products import DepthMaps, Scene
 from smust3r_colmap.storage.codec import Codec
 from smust3r_colmap.storage.depth_maps import StoredDepthMaps
+from smust3r_colmap.storage.digest import digest_of
 from smust3r_colmap.storage.run_directory import (
     DATABASE_FILE,
     FORMAT_VERSION,
@@ -200,7 +200,7 @@ def _check_image(path: Path, record: ImportRecord) -> None:
         status = path.stat()
         if (status.st_size, status.st_mtime_ns) == (record.size_bytes, record.mtime_ns):
             return
-        same = status.st_size == record.size_bytes and _digest(path) == record.digest
+        same = status.st_size == record.size_bytes and digest_of(path.read_bytes()) == record.digest
     except FileNotFoundError as error:
         raise ImageError(f"{record.name}: is not in {path.parent} any more; say with --images where it is") from error
     except OSError as error:
@@ -210,7 +210,3 @@ def _check_image(path: Path, record: ImportRecord) -> None:
             f"{path}: has changed since the run ({record.size_bytes} bytes then, {status.st_size} now); "
             "put the old file back, or reconstruct again"
         )
-
-
-def _digest(path: Path) -> str:
-    return hashlib.blake2b(path.read_bytes(), digest_size=20).hexdigest()

@@ -8,6 +8,15 @@ the workspace, the one that sees it largest, and the images that are used are la
 is blended, so that exposure changes show as seams, and there are no more pixels than the workspace's images have,
 which are as small as the depth maps. Faces that no image sees well enough keep their vertex colours.
 
+Open3D has a texture of its own (``compute_uvatlas``, then ``project_images_to_albedo``; both run on the CPU without a
+screen). It was tried on a scene of known colours, six images of 165 x 121 pixels and 115,000 faces, and not taken:
+
+- It needed 211 s (the atlas 140 s, the projection 71 s) and 1.4 GB, the texture here 2.5 s and 0.4 GB. Meshes of real
+  scenes have ten times as many faces.
+- At the middle of a face its colour was off by 2.3 grey levels in the median and 4.9 at the 90th percentile, here by
+  0.7 and 1.3: it resamples and blends what is copied here.
+- It asks for a manifold mesh, and does not tell which faces no image sees.
+
 Open3D is imported here only, and in a child process: a machine without its system libraries loses the mesh and
 nothing else.
 """

@@ -9,7 +9,6 @@ The next module to read is ``inverse_depth``.
 from __future__ import annotations
 
 import shutil
-import struct
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,13 +20,13 @@ from pathlib import Path, PurePosixPath
 import cv2
 import numpy as np
 import numpy.typing as npt
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError
 
 from smust3r_colmap.errors import ImageError, InputError
 from smust3r_colmap.execution.task_pool import usable_cores
 from smust3r_colmap.exporters.centred_pinhole import CentredPinhole, resampled
 from smust3r_colmap.geometry.arrays import UInt8Array
-from smust3r_colmap.importers.images import load_rgb
+from smust3r_colmap.importers.images import TURNED_SIDEWAYS, load_rgb, orientation_to_apply
 from smust3r_colmap.importers.masks import find_mask, load_mask
 from smust3r_colmap.products import SourceImage
 
@@ -45,7 +44,6 @@ IMAGES_PER_LOOKUP = 16
 
 _Lookup = npt.NDArray[np.float32] | None
 _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
-_TURNED_SIDEWAYS = (5, 6, 7, 8)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,14 +77,14 @@ def look_at_image(images: Path, name: str, camera: CentredPinhole) -> TrainerIma
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # Orthophotos are that large.
             with Image.open(path, formats=_FORMATS) as head:
                 kind, size, mode = head.format, head.size, head.mode
-                turn = _orientation(head)
+                turn = orientation_to_apply(head)
         with path.open("rb") as file:
             bit_depth = file.read(25)[24]  # PNG 11.2.1: signature 8, chunk head 8, width 4, height 4, bit depth.
     except FileNotFoundError as error:
         raise ImageError(f"{name}: there is no such file in {images}; give the folder the model was made of") from error
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, IndexError) as error:
         raise ImageError(f"{name}: cannot be read as JPEG, PNG, WebP or TIFF ({error})") from error
-    sideways = turn in _TURNED_SIDEWAYS
+    sideways = turn in TURNED_SIDEWAYS
     upright = size[::-1] if sideways else size
     if upright != (width, height):
         turned = f" (stored as {size[0]}x{size[1]}, turned by its EXIF orientation)" if sideways else ""
@@ -99,18 +97,8 @@ def look_at_image(images: Path, name: str, camera: CentredPinhole) -> TrainerIma
         source=SourceImage(name=name, path=path, width=width, height=height, camera=0, digest=""),
         suffix=".jpg" if kind in ("JPEG", "MPO") else ".png",  # MPO: JPEG of phones with a second image behind
         camera=camera,
-        verbatim=plain and mode == "RGB" and turn in (0, 1) and camera.is_identity,
+        verbatim=plain and mode == "RGB" and turn == 1 and camera.is_identity,
     )
-
-
-def _orientation(head: Image.Image) -> int:
-    """EXIF orientation as ``load_rgb`` applies it: TIFF comes upright from Pillow, and broken EXIF says nothing."""
-    if head.format == "TIFF":
-        return 1
-    try:
-        return int(head.getexif().get(ExifTags.Base.Orientation, 1))
-    except (OSError, SyntaxError, ValueError, TypeError, KeyError, struct.error):
-        return 1
 
 
 # ----------------------------------------------------------------------------- writing

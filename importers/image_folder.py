@@ -8,7 +8,6 @@ order is natural (img2 before img10). A bad image is left out with a reason and 
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 import re
@@ -25,10 +24,12 @@ import pycolmap
 
 from smust3r_colmap.config import CameraMode, ImportConfig
 from smust3r_colmap.errors import CollectionError, ConfigError, ImageError
+from smust3r_colmap.execution.task_pool import usable_cores
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.camera_prior import DEFAULT_FOCAL_RATIO, focal_prior_px
 from smust3r_colmap.importers.images import MAX_FILE_BYTES, SUFFIXES, Photo, inspect
 from smust3r_colmap.products import ImageCollection, RejectedImage, SourceImage
+from smust3r_colmap.storage.digest import digest_of
 
 logger = logging.getLogger(__name__)
 
@@ -151,7 +152,7 @@ def scan_image_folder(folder: Path, *, known: Mapping[str, ImportRecord] | None 
     """
     listing = _list_folder(folder)
     look = partial(_record, folder, known or {})
-    with ThreadPoolExecutor(workers or _usable_cores()) as pool:
+    with ThreadPoolExecutor(workers or min(usable_cores(), MAX_THREADS)) as pool:
         results = list(pool.map(look, listing.names))
     unreadable = [*listing.unreadable, *(result for result in results if isinstance(result, RejectedImage))]
     return FolderScan(
@@ -273,15 +274,10 @@ def _record(folder: Path, known: Mapping[str, ImportRecord], name: str) -> Impor
         name=name,
         size_bytes=status.st_size,
         mtime_ns=status.st_mtime_ns,
-        digest=hashlib.blake2b(data, digest_size=20).hexdigest(),
+        digest=digest_of(data),
         photo=photo,
         reason=reason,
     )
-
-
-def _usable_cores() -> int:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, MAX_THREADS)
 
 
 # --------------------------------------------------------------------------- collection

@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from PIL import ExifTags
-from PIL.Image import DecompressionBombError
+from PIL.Image import DecompressionBombError, Image
 from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
@@ -45,6 +45,9 @@ logger = logging.getLogger(__name__)
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
 """Of files taken for images, in any case; what is inside is told by the content."""
+
+TURNED_SIDEWAYS = frozenset({5, 6, 7, 8})
+"""EXIF orientations that swap width and height (EXIF 2.3, 4.6.4 A)."""
 
 MIN_SIDE_PX = 32
 """Smaller images hold no features; icons and tracking pixels lie in many folders."""
@@ -194,7 +197,7 @@ def _open(data: bytes) -> ImageFile:
 
 def _upright_size(image: ImageFile) -> tuple[int, int]:
     width, height = image.size
-    return (height, width) if _orientation(image) in (5, 6, 7, 8) else (width, height)
+    return (height, width) if orientation_to_apply(image) in TURNED_SIDEWAYS else (width, height)
 
 
 def _check_size(width: int, height: int) -> None:
@@ -205,10 +208,15 @@ def _check_size(width: int, height: int) -> None:
         raise ImageError(f"{width}x{height} px are {megapixels:.0f} megapixels; at most {MAX_MEGAPIXELS} are read")
 
 
-def _orientation(image: ImageFile) -> int:
-    """EXIF orientation 1 to 8 that is still to be applied; 1 where there is none or it is nonsense."""
+def orientation_to_apply(image: Image) -> int:
+    """EXIF orientation 1 to 8 of the pixels as Pillow gives them; 1 is upright."""
     if isinstance(image, TiffImageFile):
         return 1  # Pillow and OpenCV turn TIFF themselves, in every mode.
+    return stored_orientation(image)
+
+
+def stored_orientation(image: Image) -> int:
+    """EXIF orientation 1 to 8 of the pixels in the file; 1 where there is none or it is nonsense."""
     try:
         orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
     except _DECODE_ERRORS as error:
@@ -248,7 +256,7 @@ def _check_end(image: JpegImageFile, data: bytes) -> None:
 
 def _decode(image: ImageFile, data: bytes, *, grey: bool) -> UInt8Array:
     """(H, W) or (H, W, 3) upright, contiguous and writeable."""
-    orientation = _orientation(image)
+    orientation = orientation_to_apply(image)
     if _is_deep(image, data):
         image.load()  # Pillow raises where data is missing; OpenCV fills with black.
         pixels = _decode_deep(data, grey=grey)

@@ -8,7 +8,6 @@ its own EXIF says of turning is not looked at. The next module to read is ``mask
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -20,6 +19,7 @@ from smust3r_colmap.errors import ImageError, InputError
 from smust3r_colmap.geometry.arrays import UInt8Array
 from smust3r_colmap.importers.images import stored_size
 from smust3r_colmap.products import ImageCollection, ImageMask, SourceImage
+from smust3r_colmap.storage.digest import digest_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +81,7 @@ def check_masks(masks: MaskSet, names: Iterable[str]) -> None:
         raise InputError(f"{masks.folder}: the masks of the run are not there any more; {way_out}")
     for name in names:
         path = find_mask(masks.folder, name)
-        then, now = masks.digest_of.get(name, ""), "" if path is None else _digest(_read(path))
+        then, now = masks.digest_of.get(name, ""), "" if path is None else digest_of(_read(path))
         if then != now:
             what = "has changed" if then and now else "is gone" if then else "is new"
             raise ImageError(f"{path or masks.folder}: the mask of {name} {what} since the run; {way_out}")
@@ -125,7 +125,7 @@ def _with_mask(image: SourceImage, folder: Path) -> SourceImage:
     except ImageError as error:
         raise _no_image(path) from error
     _check_size(path, size, image)
-    return replace(image, mask=ImageMask(path=path, digest=_digest(data)))
+    return replace(image, mask=ImageMask(path=path, digest=digest_of(data)))
 
 
 def _refuse_photographs(images: Sequence[SourceImage]) -> None:
@@ -141,10 +141,6 @@ def _read(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
-
-
-def _digest(data: bytes) -> str:
-    return hashlib.blake2b(data, digest_size=20).hexdigest()
 
 
 def _check_size(path: Path, size: tuple[int, int], image: SourceImage) -> None:

@@ -7,7 +7,6 @@ does the rest. docs/backbones.md shows a whole one.
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections import Counter
 from collections.abc import Collection, Sequence
@@ -32,6 +31,7 @@ from smust3r_colmap.products import (
     UnregisteredImage,
 )
 from smust3r_colmap.storage.dense_maps import ImageMaps, StoredMaps, write_maps
+from smust3r_colmap.storage.digest import digest_of
 from smust3r_colmap.storage.run_directory import (
     StageFolder,
     key_of,
@@ -103,7 +103,7 @@ def fingerprint_of(weights: Path) -> str:
                 blocks.append(file.read(_SAMPLED_BYTES))
     except OSError as error:
         raise CheckpointError(f"{weights}: cannot be read: {error.strerror}") from error
-    return key_of(size, hashlib.blake2b(b"".join(blocks), digest_size=16).hexdigest())
+    return key_of(size, digest_of(b"".join(blocks)))
 
 
 class Predictor(Protocol):

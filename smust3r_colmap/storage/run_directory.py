@@ -32,7 +32,6 @@ next start tries it again. Arrays are safetensors, facts are JSON, nothing is pi
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -50,6 +49,7 @@ from filelock import FileLock, Timeout
 
 from smust3r_colmap.errors import RunDirectoryError, RunLockedError, StorageError
 from smust3r_colmap.storage.atomic_write import write_atomically
+from smust3r_colmap.storage.digest import digest_of
 
 IMPORT_STAGE, STITCHED_STAGE, REFINED_STAGE, SCENE_STAGE = "import", "stitched", "refined", "scene"
 """Folders below ``work`` that are read again when a finished run is exported."""
@@ -201,7 +201,7 @@ class StageFolder:
 def key_of(*parts: object) -> str:
     """A hash of inputs and settings (JSON-able values, dataclasses, other keys)."""
     text = json.dumps([FORMAT_VERSION, *parts], sort_keys=True, default=_hashable, ensure_ascii=False)
-    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+    return digest_of(text.encode())
 
 
 def write_json(path: Path, facts: object) -> None:
@@ -268,7 +268,7 @@ def _remove(path: Path) -> None:
 def _hashable(value: object) -> object:
     """As ``_jsonable``, but arrays by the hash of their bytes, and dataclasses with arrays inside."""
     if isinstance(value, np.ndarray):
-        return [str(value.dtype), value.shape, hashlib.blake2b(value.tobytes(), digest_size=16).hexdigest()]
+        return [str(value.dtype), value.shape, digest_of(value.tobytes())]
     if is_dataclass(value) and not isinstance(value, type):
         return {field.name: getattr(value, field.name) for field in fields(value)}
     return _jsonable(value)

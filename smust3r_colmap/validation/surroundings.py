@@ -13,10 +13,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError
 
 from smust3r_colmap.geometry.arrays import FloatArray
-from smust3r_colmap.importers.images import SUFFIXES
+from smust3r_colmap.importers.images import SUFFIXES, TURNED_SIDEWAYS, stored_orientation
 from smust3r_colmap.validation.description import (
     Database,
     DatabaseImage,
@@ -26,9 +26,6 @@ from smust3r_colmap.validation.description import (
     ImageFile,
     PlyCloud,
 )
-
-_QUARTER_TURNS = frozenset({5, 6, 7, 8})
-"""EXIF orientations that swap width and height."""
 
 _PLY_TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1"},
@@ -57,7 +54,7 @@ def read_image_file(path: Path, name: str) -> ImageFile:
     """One image file by its header, to be known as ``name``."""
     try:
         with Image.open(path) as image:
-            turned = image.getexif().get(ExifTags.Base.Orientation, 1) in _QUARTER_TURNS
+            turned = stored_orientation(image) in TURNED_SIDEWAYS
             return ImageFile(name=name, width=image.width, height=image.height, turned=turned)
     except (OSError, SyntaxError, ValueError, UnidentifiedImageError, Image.DecompressionBombError):
         return ImageFile(name=name, width=0, height=0)
