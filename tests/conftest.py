@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator
+from itertools import groupby
 from pathlib import Path
+from statistics import fmean
 from typing import TYPE_CHECKING
 
 import pytest
@@ -14,15 +16,6 @@ if TYPE_CHECKING:
     from helpers.finished_runs import Example
 
 ONE_OF_SEVERAL = "PYTEST_XDIST_WORKER" in os.environ
-SLOW_FILES = (
-    "test_real_data.py",
-    "test_pipeline.py",
-    "test_must3r_network.py",
-    "test_must3r_room.py",
-    "test_must3r_backbone.py",
-    "test_refine_command.py",
-)
-"""From half a minute up, the slowest first."""
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
 
@@ -32,10 +25,16 @@ if ONE_OF_SEVERAL:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Several processes take the slow files first, so that none is left at the end with one of them to do."""
+    """Several processes take the files with most slow tests first, so that none is left at the end with one of them.
+
+    Files stay together, because their tests share fixtures.
+    """
     if ONE_OF_SEVERAL:
-        rank = {name: k for k, name in enumerate(SLOW_FILES)}
-        items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
+        slow_share = {
+            path: fmean(item.get_closest_marker("slow") is not None for item in of_file)
+            for path, of_file in groupby(items, key=lambda item: item.path)
+        }
+        items.sort(key=lambda item: -slow_share[item.path])
 
 
 @pytest.fixture(scope="session")

@@ -384,6 +384,7 @@ def run(room: Path, output: Path, config: RunConfig = CONFIG) -> RunSummary:
     return reconstruct(room / "images", output, config, reporter=QuietReporter(sys.stderr))
 
 
+@pytest.mark.slow
 def test_a_whole_run_closes_its_loop_and_goes_on_for_nothing(room: Path, tmp_path: Path) -> None:
     summary = run(room, tmp_path / "out")
     assert (summary.exit_code, summary.weak_reasons, summary.metric) == (0, (), True)
@@ -397,6 +398,7 @@ def test_a_whole_run_closes_its_loop_and_goes_on_for_nothing(room: Path, tmp_pat
     assert [one.reused for one in again.stages if one.name == "room"] == [True]
 
 
+@pytest.mark.slow
 def test_doubts_make_a_run_weak_and_leave_its_model(room: Path, tmp_path: Path) -> None:
     summary = run(room, tmp_path / "out", replace(CONFIG, backbone_options="warnings=all is fog"))
     assert summary.exit_code == 3

@@ -184,6 +184,7 @@ print(sorted({"torch", "pycolmap", "numpy"} & set(sys.modules)))
     assert child.stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_a_classical_backbone_needs_no_torch() -> None:
     program = """
 import sys
@@ -270,6 +271,7 @@ def mynet(install: Install, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
 NUM_IMAGES = 16
 
 
+@pytest.mark.slow
 def test_the_example_of_the_page_reconstructs_the_demo(mynet: Path, tmp_path: Path) -> None:
     write_demo(tmp_path / "room", num_images=NUM_IMAGES, width=160, height=120)
     config = RunConfig(

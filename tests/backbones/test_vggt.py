@@ -291,6 +291,7 @@ def test_the_network_sees_the_middle_of_the_image_with_white_around(
     np.testing.assert_array_equal(panorama[:, 84:], 255)
 
 
+@pytest.mark.slow
 def test_a_whole_run_gives_the_true_trajectory(room: Room, checkpoint: Path, tmp_path: Path) -> None:
     photographs(tmp_path / "images", room, [CAMERAS["portrait"]] * NUM_IMAGES)
     config = RunConfig(

@@ -58,6 +58,7 @@ def own_images(run: Path, finished_example: Example, tmp_path: Path) -> Path:
 
 
 # ------------------------------------------------------------------------------ formats
+@pytest.mark.slow
 def test_what_was_deleted_is_written_again_byte_by_byte(run: Path) -> None:
     before = content(run)
     for name in ("sparse", "database.db", "points.ply"):
@@ -75,6 +76,7 @@ def test_text_glb_and_trajectory_are_added_on_demand(run: Path) -> None:
         export(run, "--format", "sparse", "--text")
 
 
+@pytest.mark.slow
 def test_a_trainer_folder_is_made_with_masks_scales_and_notes(
     run: Path, finished_example: Example, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -611,6 +611,7 @@ def test_doctor_is_content_without_open3d(monkeypatch: pytest.MonkeyPatch, capsy
     assert "accelerators: none" in out
 
 
+@pytest.mark.slow
 def test_doctor_says_of_every_backbone_what_it_lacks(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -643,6 +644,7 @@ def test_doctor_says_of_every_backbone_what_it_lacks(
     assert "No module named 'no_such_package'" in lines[7]
 
 
+@pytest.mark.slow
 def test_doctor_says_whether_must3r_has_its_weights(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

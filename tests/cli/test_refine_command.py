@@ -32,6 +32,8 @@ from smust3r_colmap.report.summary import RunSummary
 from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
 from smust3r_colmap.validation.surroundings import read_ply
 
+pytestmark = pytest.mark.slow
+
 NUM_IMAGES = 8
 CAMERA = demo_intrinsics(320, 240)
 NETWORK_SIZE = (518, 392)

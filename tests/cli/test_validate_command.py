@@ -169,6 +169,7 @@ def test_wrong_use_is_an_error_of_the_caller(model: Path, tmp_path: Path) -> Non
         run(str(model), "--readers", "Metashape")
 
 
+@pytest.mark.slow
 def test_pycolmap_is_asked_in_a_process_of_its_own(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What it says alone would help nobody; beside it stands what is missing."""
     (model / "rigs.bin").unlink()

@@ -140,6 +140,7 @@ def open_many_times(path: Path) -> int:
     return found
 
 
+@pytest.mark.slow
 def test_processes_that_open_the_database_at_the_same_moment_wait_for_each_other(tmp_path: Path) -> None:
     path = synthetic_segment(tmp_path).task.database
     with TaskPool(workers=2) as pool:

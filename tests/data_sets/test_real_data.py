@@ -20,6 +20,8 @@ from smust3r_colmap.execution.progress import QuietReporter
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.report.summary import RunSummary
 
+pytestmark = [pytest.mark.slow, pytest.mark.data]
+
 CONFIG = RunConfig(
     segmentation=SegmentationConfig(segment_length=8, overlap=4),
     classical=ClassicalConfig(max_image_size=1024, max_features=2500, dense_size=256),

@@ -107,6 +107,7 @@ def test_the_page_has_a_snippet_in_every_section_that_promises_one(tmp_path: Pat
     ]
 
 
+@pytest.mark.slow
 def test_points_are_triangulated_anew_without_moving_a_camera(
     continued: Path, before: pycolmap.Reconstruction, finished_example: Example
 ) -> None:

@@ -98,6 +98,7 @@ print("LOADED", sorted(heavy & set(sys.modules)))
     assert child.stdout.splitlines()[-1] == "LOADED []"
 
 
+@pytest.mark.slow
 def test_a_reconstruction_loads_neither_torch_nor_open3d() -> None:
     program = """
 import sys

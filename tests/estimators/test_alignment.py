@@ -270,6 +270,7 @@ def test_information_is_the_curvature_of_the_cost() -> None:
     np.testing.assert_allclose(estimate.information, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_information_predicts_the_scatter_of_the_estimate(kernel: RobustKernel) -> None:
     rng = np.random.default_rng(5)

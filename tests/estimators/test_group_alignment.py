@@ -115,6 +115,7 @@ def test_warp_survives_30_percent_one_sided_outliers(group: BendingGroup, kernel
     assert 3 <= fit.estimate.iterations <= 40
 
 
+@pytest.mark.slow
 def test_rotation_of_sl4_is_within_half_a_degree_in_the_worst_of_twenty_seeds() -> None:
     worst = 0.0
     for seed in range(20):
@@ -282,6 +283,7 @@ def test_information_is_the_curvature_of_the_cost(group: TransformGroup) -> None
     np.testing.assert_allclose(found.information, expected, rtol=1e-5, atol=1e-7 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("group", BENDING)
 def test_information_predicts_the_scatter_of_the_estimate(group: BendingGroup, kernel: RobustKernel) -> None:

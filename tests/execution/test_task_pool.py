@@ -33,10 +33,12 @@ def outcomes(tasks: list[int | str]) -> dict[int, int | TaskFailure]:
         return {result.index: result.value for result in pool.map(square_unless_told_otherwise, tasks)}
 
 
+@pytest.mark.slow
 def test_every_task_gives_its_own_result() -> None:
     assert outcomes([3, 4, 5]) == {0: 9, 1: 16, 2: 25}
 
 
+@pytest.mark.slow
 def test_a_child_that_dies_costs_only_its_own_task() -> None:
     found = outcomes([1, 2, "die", 3, 4, 5, 6])
     died = found.pop(2)
@@ -46,11 +48,13 @@ def test_a_child_that_dies_costs_only_its_own_task() -> None:
     assert found == {0: 1, 1: 4, 3: 9, 4: 16, 5: 25, 6: 36}
 
 
+@pytest.mark.slow
 def test_an_error_becomes_a_failure_with_its_text() -> None:
     failed = outcomes([1, "raise"])[1]
     assert failed == TaskFailure(reason="ValueError: bad value 7", crashed=False)
 
 
+@pytest.mark.slow
 def test_an_error_inside_opencv_costs_only_its_task() -> None:
     found = outcomes([1, "opencv"])
     failed = found.pop(1)
@@ -76,6 +80,7 @@ def processes(pool: TaskPool, work_s: float = 0.0) -> set[int | TaskFailure]:
     return {result.value for result in pool.map(process_of, [work_s] * 4)}
 
 
+@pytest.mark.slow
 def test_children_of_a_pool_serve_batch_after_batch_and_their_time_is_counted_at_once() -> None:
     with TaskPool(workers=1) as pool:
         assert living_children_cpu_s() == 0
@@ -89,6 +94,7 @@ def test_children_of_a_pool_serve_batch_after_batch_and_their_time_is_counted_at
     assert os.times().children_user - ended.children_user > 0.3  # the system's account has it now
 
 
+@pytest.mark.slow
 def test_a_pool_goes_on_with_a_new_child_after_one_died() -> None:
     with TaskPool(workers=1) as pool:
         (dead,) = processes(pool)

@@ -88,6 +88,7 @@ def pinhole(folder: Path, name: str) -> tuple[Intrinsics, npt.NDArray[np.float64
 
 
 # ------------------------------------------------------------------------------ layout
+@pytest.mark.slow
 def test_layout_is_that_of_colmap(written: Written) -> None:
     found = {str(path.relative_to(written.folder)) for path in written.folder.rglob("*") if path.is_file()}
     with_map = [name for name in WORKSPACE_NAMES if name != WITHOUT_MAP]

@@ -130,6 +130,7 @@ def found(views: list[MappedView]) -> Correspondences:
     return match_by_pointmaps(views, neighbours(len(views)), max_keypoints=500)
 
 
+@pytest.mark.slow
 def test_matches_are_right_to_a_tenth_of_a_pixel_although_cameras_are_off_by_ten(
     found: Correspondences, photos: list[Photo], views: list[MappedView]
 ) -> None:

@@ -21,6 +21,8 @@ from smust3r_colmap.refinement.stage import InitialScenes, Refinement, refine
 from smust3r_colmap.storage.depth_maps import DepthMapWriter, StoredDepthMaps
 from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
 
+pytestmark = pytest.mark.slow
+
 NUM_IMAGES, WITHOUT_POSE = 7, 6
 CAMERA = demo_intrinsics(320, 240)
 CONFIDENCE, SCALE_ERROR = 3.0, 1.01

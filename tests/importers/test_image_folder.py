@@ -227,6 +227,7 @@ def test_tiny_images_are_left_out(folder: Path) -> None:
     }
 
 
+@pytest.mark.slow
 def test_an_image_20000_pixels_wide_is_read(folder: Path) -> None:
     # 200 megapixels, above the 178 at which Image.open refuses.
     Image.new("L", (20000, 10000), 77).save(folder / "wide.jpg")
@@ -669,6 +670,7 @@ def test_random_damage_never_escapes_as_another_error(tmp_path: Path, suffix: st
     assert refused > 0
 
 
+@pytest.mark.data
 def test_the_shrunken_drone_photos_get_a_focal_length_near_the_reference(data_dir: Callable[[str], Path]) -> None:
     collection = import_image_folder(data_dir("caliterra_drone") / "images", AUTO)
     assert len(collection) == 75
@@ -679,6 +681,7 @@ def test_the_shrunken_drone_photos_get_a_focal_length_near_the_reference(data_di
     assert 0.95 < camera.focal_px / 769.6 < 1.05
 
 
+@pytest.mark.data
 def test_tourist_photographs_get_a_camera_each(data_dir: Callable[[str], Path]) -> None:
     collection = import_image_folder(data_dir("sacre_coeur") / "images", AUTO)
     assert len(collection) == 10

@@ -92,6 +92,7 @@ def write_mask(path: Path, width: int = WIDTH, height: int = HEIGHT) -> Path:
 
 
 # ------------------------------------------------------------------------------- finding
+@pytest.mark.slow
 def test_masks_are_found_by_the_whole_name_first_and_missing_ones_are_named(drive: Drive, tmp_path: Path) -> None:
     write_mask(tmp_path / "000.png.png")
     write_mask(tmp_path / "000.png")
@@ -200,6 +201,7 @@ def hidden(xy_img: FloatArray) -> npt.NDArray[np.bool_]:
     return np.asarray((row >= STICKER[0].start) & (row < STICKER[0].stop), np.bool_)
 
 
+@pytest.mark.slow
 def test_masked_pixels_have_no_features_and_the_others_keep_theirs(drive: Drive, tmp_path: Path) -> None:
     plain, masked = collection_of(drive), collection_of(drive, drive.masks)
     twice = replace(plain, images=(plain.images[0], replace(masked.images[0], name="again.png")))
@@ -321,6 +323,7 @@ def masked_run(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> tuple[
     return output, warnings.getvalue()
 
 
+@pytest.mark.slow
 def test_a_masked_run_finds_the_cameras_and_names_images_without_a_mask(
     drive: Drive, masked_run: tuple[Path, str]
 ) -> None:

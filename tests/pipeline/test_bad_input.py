@@ -25,6 +25,8 @@ from smust3r_colmap.synthetic.backbone import OracleBackbone
 from smust3r_colmap.synthetic.settings import PRESETS, OracleSettings
 from smust3r_colmap.synthetic.truth import TrueScene, collection_of
 
+pytestmark = pytest.mark.slow
+
 Maps = tuple[Float32Array, Float32Array, Float32Array]
 """Points, depth and confidence of one image."""
 Change = Callable[[Float32Array, Float32Array, Float32Array], Maps]

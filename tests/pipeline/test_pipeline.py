@@ -43,6 +43,8 @@ from smust3r_colmap.report.summary import RunSummary
 from smust3r_colmap.storage.config_file import config_to_toml
 from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics, write_demo
 
+pytestmark = pytest.mark.slow
+
 NUM_IMAGES = 24
 NUM_BRIEF = 12
 """The first images of the room, for tests of something else than where its cameras are: half a walk."""

@@ -586,6 +586,7 @@ def test_image_that_was_placed_on_too_little_is_given_up_again(tmp_path: Path, m
 
 
 # ------------------------------------------------------------------------- undone
+@pytest.mark.slow
 def test_adjustments_that_diverge_are_undone_and_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def diverge(model: pycolmap.Reconstruction, *_: Any, **__: Any) -> bool:
         rng = np.random.default_rng(0)
@@ -680,6 +681,7 @@ def in_this_process(function: Callable[[Any], Any], task: Any, **_: Any) -> Any:
     return function(task)
 
 
+@pytest.mark.slow
 def test_child_does_the_work_and_a_second_start_reads_what_it_stored(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -775,6 +777,7 @@ def test_child_that_is_killed_leaves_the_stitched_scenes_with_a_reason(start: St
     assert not list((start.output / "work").glob("refined*/stage.json"))
 
 
+@pytest.mark.slow
 def test_database_that_breaks_leaves_the_stitched_scenes_with_a_reason(start: Start) -> None:
     with sqlite3.connect(start.features.database) as connection:
         connection.execute("UPDATE keypoints SET rows = 5")

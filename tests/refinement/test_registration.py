@@ -46,6 +46,7 @@ def drop_the_first(task: _MappingTask) -> None:
     model.write(task.output)
 
 
+@pytest.mark.slow
 def test_an_image_taken_out_comes_back_to_its_place_and_all_others_stay(
     finished_example: Example, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -72,6 +73,7 @@ def test_an_image_taken_out_comes_back_to_its_place_and_all_others_stay(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_an_image_whose_matches_deny_its_place_is_given_up(finished_example: Example, tmp_path: Path) -> None:
     before = without(finished_example, TAKEN_OUT)
     asked: list[int] = []
@@ -100,6 +102,7 @@ def move_a_camera(task: _MappingTask) -> None:
     model.write(task.output)
 
 
+@pytest.mark.slow
 def test_a_mapper_that_moves_what_stood_is_undone(
     finished_example: Example, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -122,6 +125,7 @@ def test_a_mapper_that_dies_adds_nothing(
     assert done.report.reason == "COLMAP's mapper failed: the process died"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("added", [True, False])
 def test_the_refinement_stores_what_completion_added(
     added: bool, finished_example: Example, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

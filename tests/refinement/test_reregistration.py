@@ -95,6 +95,7 @@ def straightened(world: World, tmp_path_factory: pytest.TempPathFactory) -> Repl
     return place_bent_images_again(bench, features, TOLERANCE)
 
 
+@pytest.mark.slow
 def test_images_beyond_the_bend_come_back_to_the_truth(world: World, straightened: Replacement) -> None:
     assert sorted(straightened.cam_from_world) == list(BENT)
     distance, turn = off_by(world, poses_of(straightened.bench.model))
@@ -166,6 +167,7 @@ def test_images_that_are_bent_in_new_places_too_stay_in_the_old_ones(
     refused(result, bench, r"4 images are bent, and \d of them also in new places")
 
 
+@pytest.mark.slow
 def test_bent_images_stay_where_the_mapper_finds_nothing(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -186,6 +188,7 @@ def test_too_many_bent_images_are_another_matter(world: World, tmp_path: Path, m
     refused(result, bench, "4 images are bent, and more than 3 are not placed again")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_true", [12, 25])
 def test_look_alikes_do_not_move_an_image_that_stands_right(world: World, tmp_path: Path, num_true: int) -> None:
     """The last image also shows what the third sees: many matches with images there, few with its neighbours."""
@@ -211,6 +214,7 @@ def test_look_alikes_do_not_move_an_image_that_stands_right(world: World, tmp_pa
     assert distance < 1e-9
 
 
+@pytest.mark.slow
 def test_refinement_straightens_a_bend_and_keeps_the_scale(world: World, tmp_path: Path) -> None:
     collection = make_collection(tmp_path, NUM_IMAGES, calibrated=True)
     pairs = pairs_within(range(NUM_IMAGES), 4)

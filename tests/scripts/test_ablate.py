@@ -25,6 +25,8 @@ from smust3r_colmap.products import EMPTY_CLOUD, Scene
 from smust3r_colmap.synthetic.settings import PRESETS, REFERENCE_LENGTH
 from smust3r_colmap.synthetic.truth import TrueScene
 
+pytestmark = pytest.mark.slow
+
 BASE = ablate.with_length(RunConfig(), 16)
 NUM_IMAGES = 60
 

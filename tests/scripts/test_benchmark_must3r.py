@@ -62,6 +62,7 @@ def test_stopwatch_tells_working_from_waiting() -> None:
     assert 0.2 <= works.cpu_s < 0.4 and works.images == 6
 
 
+@pytest.mark.slow
 def test_peak_is_that_of_this_process() -> None:
     before = benchmark.peak_bytes(CPU)
     taken = np.ones(before + 64 * 2**20, dtype=np.uint8)
@@ -83,6 +84,7 @@ def test_stages_are_divided_by_their_own_number_of_images() -> None:
 
 
 # ------------------------------------------------------------------------------- the modes
+@pytest.mark.slow
 def test_every_mode_measures_every_stage_of_every_image(rows: dict[str, benchmark.Row]) -> None:
     assert tuple(rows) == tuple(benchmark.MODES)
     for row in rows.values():
@@ -183,6 +185,7 @@ def test_ratios_are_those_to_the_first_mode(rows: dict[str, benchmark.Row]) -> N
         assert ratios == ["1.000", ratio] * (len(benchmark.STAGES) + 1)
 
 
+@pytest.mark.slow
 def test_script_measures_in_a_process_of_its_own_and_writes_its_figures(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

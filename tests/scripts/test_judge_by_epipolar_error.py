@@ -255,6 +255,7 @@ def words(room: Path, *labels: str) -> list[str]:
     return [str(room / "images"), *(f"{label}={room / label}" for label in labels), "--pairs", "5"]
 
 
+@pytest.mark.slow
 def test_the_true_model_of_rendered_images_wins(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report = room / "report.json"
     assert judge.main([*words(room, "true", "disturbed", "long"), "--json", str(report)]) == 0
@@ -268,6 +269,7 @@ def test_the_true_model_of_rendered_images_wins(room: Path, capsys: pytest.Captu
     assert [line.split()[0] for line in table[1:]] == ["model", "true", "disturbed", "long"]
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_figures(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
     outputs = []
     for _ in range(2):

@@ -139,6 +139,7 @@ def test_what_cannot_be_run_ends_with_exit_code_2(
 
 
 # ------------------------------------------------------------------------------ whole run
+@pytest.mark.data
 def test_the_kitchen_without_errors_comes_out_in_metres(
     data_dir: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -294,6 +294,7 @@ def _gtsam_optimum(gtsam, graph: PoseGraph, start: Transform) -> tuple[Sim3, flo
     return Sim3.from_matrix(nodes), 2 * factors.error(result)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", ["cauchy", "gnc"])
 @pytest.mark.parametrize("seed", range(3))
 def test_12_wrong_loops_of_40_are_rejected_and_no_true_one(kernel: str, seed: int) -> None:
@@ -309,6 +310,7 @@ def test_12_wrong_loops_of_40_are_rejected_and_no_true_one(kernel: str, seed: in
     assert ate(world, naive.world_from_node) > 5 * ate(world, found.world_from_node)
 
 
+@pytest.mark.slow
 def test_long_chain_with_drift_of_a_sixth_of_its_size_keeps_its_true_loops() -> None:
     world, graph, start, _ = measured_ring(2001, 60)
     found = optimise(graph, start)
@@ -318,6 +320,7 @@ def test_long_chain_with_drift_of_a_sixth_of_its_size_keeps_its_true_loops() -> 
     assert ate(world, found.world_from_node) < 1.1 * ate(world, reference.world_from_node) < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1 / 9, 9.0])
 def test_information_wrong_by_a_factor_of_nine_changes_no_decision(factor: float) -> None:
     _, graph, start, wrong = measured_ring(201, 40, 12)
@@ -326,6 +329,7 @@ def test_information_wrong_by_a_factor_of_nine_changes_no_decision(factor: float
     assert found.information_scale == pytest.approx(factor * optimise(graph, start).information_scale, rel=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_nodes", [201, 2001])
 def test_wrong_loops_that_agree_with_each_other_are_rejected(num_nodes: int) -> None:
     """Five places on one side of the ring look like five across: a false fold against 40 true loops."""

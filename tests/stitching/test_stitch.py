@@ -149,6 +149,7 @@ FAR_OFF = Sim3(scale=np.array(1.6), rotation=rotation_about_y(120.0), translatio
 """The other side of the building."""
 
 
+@pytest.mark.slow
 def test_a_true_loop_is_closed_and_brings_the_frames_nearer_to_the_truth() -> None:
     before, after = [], []
     gaps: list[tuple[ClosureGap, ClosureGap]] = []

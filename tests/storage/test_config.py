@@ -181,6 +181,7 @@ def test_hubers_delta_is_positive_and_finite(bad: float) -> None:
         AlignmentConfig(huber_delta=bad)
 
 
+@pytest.mark.slow
 def test_every_number_among_the_settings_refuses_nonsense() -> None:
     """What a new setting needs, too: minus a thousand is good for none of them."""
     for name in numbers_among_the_settings():

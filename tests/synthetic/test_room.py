@@ -57,6 +57,7 @@ def seen_from(
 
 
 # -------------------------------------------------------------------------- rendering
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("direction", "centre", "distance_m"),
     [
@@ -142,6 +143,7 @@ def test_every_view_has_features_all_over(scene: DemoScene) -> None:
         assert sum(point.size > 12 for point in keypoints) >= 10  # seen from further away, too
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_pictures_and_others_do_not(scene: DemoScene, other_scene: DemoScene) -> None:
     pose = scene.camera_path(4)[1]
     rgb, depth = scene.render(pose, SMALL)
@@ -181,6 +183,7 @@ def test_the_path_keeps_clear_of_the_furniture(scene: DemoScene, other_scene: De
             assert 0.35 < depth.min() <= depth.max() < 8
 
 
+@pytest.mark.slow
 def test_colmap_recovers_the_cameras(scene: DemoScene, tmp_path: Path) -> None:
     """Eight neighbouring views of a short demo, calibrated: all registered, within a centimetre."""
     intrinsics = demo_intrinsics(320, 240)
@@ -218,6 +221,7 @@ def _map_with_colmap(folder: Path, intrinsics: Intrinsics) -> None:
 
 
 # ---------------------------------------------------------------------------- writing
+@pytest.mark.slow
 def test_write_demo_writes_what_the_readers_read(scene: DemoScene, tmp_path: Path) -> None:
     write_demo(tmp_path / "new" / "demo", num_images=3, width=160, height=120, seed=0)
     folder = tmp_path / "new" / "demo"

@@ -78,6 +78,7 @@ def rms(values: Sequence[float] | FloatArray) -> float:
 
 
 # --------------------------------------------------------------------------------- truth
+@pytest.mark.slow
 def test_perfect_neighbours_align_to_their_true_relation(truth: TrueScene) -> None:
     windows = plan_windows(ViewGraph.chain(NUM_IMAGES), segment_length=60, overlap=30)
     submodels = submodels_of(oracle(truth, PERFECT), windows)
@@ -214,6 +215,7 @@ def test_own_drift_makes_neighbours_disagree_on_the_overlap(truth: TrueScene) ->
     assert 0.001 < np.mean([one.spread_log_scale for one in relations]) < 0.007
 
 
+@pytest.mark.slow
 def test_scale_and_focal_length_scatter_between_segments_as_stated(truth: TrueScene) -> None:
     pair = Segment(index=0, images=(3, 4))
     jittered = [one_submodel(truth, replace(PERFECT, scale_jitter=0.1), pair, seed) for seed in range(100)]
@@ -561,6 +563,7 @@ def rgbd_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 NAMES = tuple(f"{k:06d}.jpg" for k in range(21))
 
 
+@pytest.mark.slow
 def test_own_depth_is_read_and_missing_depth_is_carried_over(rgbd_folder: Path) -> None:
     read = TrueScene.from_rgbd_folder(rgbd_folder, NAMES, max_size=48)
     assert read.intrinsics == Intrinsics(
@@ -599,6 +602,7 @@ def test_z_buffer_keeps_the_nearest_and_nothing_behind_the_camera() -> None:
     np.testing.assert_array_equal(z_buffer(points, camera), expected)
 
 
+@pytest.mark.data
 def test_kitchen_becomes_segments_with_depth_in_every_frame(data_dir: Callable[[str], Path]) -> None:
     folder = data_dir("kitchen_rgbd")
     names = (folder / "subset_every5.txt").read_text().split()

@@ -125,6 +125,7 @@ def with_something_nasty(document: Any, rng: random.Random) -> Any:
     return [*document[:place], with_something_nasty(document[place], rng), *document[place + 1 :]]
 
 
+@pytest.mark.slow
 def test_no_transforms_file_stops_a_check(good: Subject, tmp_path: Path) -> None:
     """Numbers beyond all floats, names that no file can have, matrices of texts: all of it is a finding, or none."""
     model, rng = pycolmap.Reconstruction(good.model.folder), random.Random(0)

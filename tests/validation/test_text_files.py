@@ -156,6 +156,7 @@ def test_the_largest_ids_and_sizes_that_colmap_has_are_read_to_the_last_digit(
     assert not {"id-duplicate", "observation-dangling", "track-dangling", "track-disagrees"} & found
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_nasty_words_in_text_end_in_findings_and_not_in_errors(model: pycolmap.Reconstruction, tmp_path: Path) -> None:
     rng = random.Random(0)

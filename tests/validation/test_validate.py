@@ -120,6 +120,7 @@ def test_a_file_that_cannot_be_opened_is_named(
         read_model(tmp_path / "bin")
 
 
+@pytest.mark.data
 def test_a_real_model_gives_no_false_alarm(data_dir: Callable[[str], Path]) -> None:
     folder = data_dir("lund_street")
     report = validate(folder / "reference_sparse", images=folder / "images", ask_colmap=False)

@@ -59,6 +59,7 @@ def die_in_the_global_mapper(task: MappingTask) -> MappedSegment:
     return map_as_walk(task)
 
 
+@pytest.mark.slow
 def test_a_segment_that_failed_is_tried_again_in_the_next_run(segment: SyntheticSegment, tmp_path: Path) -> None:
     with quiet_run(tmp_path / "out") as run:
         (failed,) = backbone_of(segment, run, run_out_of_memory).reconstruct([WINDOW], with_maps=()).reconstructions
@@ -69,6 +70,7 @@ def test_a_segment_that_failed_is_tried_again_in_the_next_run(segment: Synthetic
     assert [submodel.images for submodel in mapped.submodels] == [tuple(range(6))]
 
 
+@pytest.mark.slow
 def test_a_global_mapper_that_aborts_its_process_is_left_out(segment: SyntheticSegment, tmp_path: Path) -> None:
     with quiet_run(tmp_path / "out") as run:
         (mapped,) = (

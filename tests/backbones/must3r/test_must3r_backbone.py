@@ -40,6 +40,8 @@ from smust3r_colmap.storage.run_directory import RunDirectory
 from smust3r_colmap.synthetic.must3r_weights import random_network_weights
 from smust3r_colmap.synthetic.room import write_demo
 
+pytestmark = pytest.mark.slow
+
 NUM_IMAGES = 14
 ROPE = Rope(trained_size=64, size=64)
 TINY = Architecture(

@@ -235,6 +235,7 @@ def score(camera_fit: CameraFit, errors: Errors, seeds: Sequence[int] = (0, 1)) 
 
 
 # ------------------------------------------------------------------- one against another
+@pytest.mark.slow
 @pytest.mark.parametrize("camera_fit", CAMERA_FITS)
 def test_perfect_pointmaps_give_the_true_cameras(camera_fit: CameraFit) -> None:
     found = score(camera_fit, Errors(), seeds=[0])
@@ -246,6 +247,7 @@ def test_perfect_pointmaps_give_the_true_cameras(camera_fit: CameraFit) -> None:
     assert found.centre < 0.01
 
 
+@pytest.mark.slow
 def test_robust_is_twice_as_good_as_upstream_where_depth_bends_and_no_pixel_lies() -> None:
     plain = Errors(noise=0.005, bend=0.02)
     upstream, robust, pnp = (score(fit, plain) for fit in CAMERA_FITS)
@@ -256,6 +258,7 @@ def test_robust_is_twice_as_good_as_upstream_where_depth_bends_and_no_pixel_lies
         assert found.centre < 0.5 * upstream.centre
 
 
+@pytest.mark.slow
 def test_robust_is_as_good_as_upstream_where_all_is_noise() -> None:
     upstream, robust, _ = (score(fit, Errors(noise=0.01)) for fit in CAMERA_FITS)
     assert 0.005 < upstream.rotation < 0.2
@@ -265,6 +268,7 @@ def test_robust_is_as_good_as_upstream_where_all_is_noise() -> None:
     assert robust.focal < 1.2 * upstream.focal + 0.02
 
 
+@pytest.mark.slow
 def test_wrong_pixels_of_high_confidence_spoil_upstream_and_not_robust() -> None:
     lying = Errors(noise=0.005, outliers=0.2, outlier_confidence=10.0)
     upstream, robust, pnp = (score(fit, lying) for fit in CAMERA_FITS)
@@ -276,6 +280,7 @@ def test_wrong_pixels_of_high_confidence_spoil_upstream_and_not_robust() -> None
         assert found.centre < 2 * most
 
 
+@pytest.mark.slow
 def test_wrong_pixels_of_low_confidence_spoil_upstream_a_little_and_robust_not_at_all() -> None:
     honest = Errors(noise=0.005, outliers=0.3, outlier_confidence=1.05)
     upstream, robust, _ = (score(fit, honest) for fit in CAMERA_FITS)
@@ -286,6 +291,7 @@ def test_wrong_pixels_of_low_confidence_spoil_upstream_a_little_and_robust_not_a
     assert robust.centre < 0.2
 
 
+@pytest.mark.slow
 def test_robust_survives_two_wrong_pixels_in_five_whatever_their_confidence() -> None:
     for confidence in (10.0, 1.02):
         robust = score("robust", Errors(noise=0.005, bend=0.01, outliers=0.4, outlier_confidence=confidence))
@@ -311,6 +317,7 @@ def test_a_sky_that_the_network_is_not_sure_of_has_no_say(camera_fit: CameraFit)
     assert found.inlier_share == 1.0
 
 
+@pytest.mark.slow
 def test_broken_pixels_leave_upstream_without_pose_and_robust_as_it_was() -> None:
     broken = Errors(noise=0.005, broken=0.1, behind=0.1)
     upstream, robust, pnp = (score(fit, broken) for fit in CAMERA_FITS)

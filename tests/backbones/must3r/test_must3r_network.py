@@ -239,6 +239,7 @@ def full_size_image(number: int, height: int, width: int) -> Tensor:
     return torch.from_numpy(np.stack(channels).astype(np.float32))
 
 
+@pytest.mark.slow
 @needs_vectors
 def test_full_size_network_is_that_of_the_vectors() -> None:
     """24 and 12 blocks with recipe weights: the weights, features, memory, points and cameras of three images."""

@@ -139,6 +139,7 @@ def test_doctor_is_told_of_processor_and_cards(monkeypatch: pytest.MonkeyPatch) 
     assert card == "Test Card: bfloat16, for Test Card has compute capability 9.0"
 
 
+@pytest.mark.slow
 def test_description_prints_from_a_child_process() -> None:
     program = "from smust3r_colmap.backbones.must3r.precision import *\nprint(*describe_precision(), sep='\\n')"
     child = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

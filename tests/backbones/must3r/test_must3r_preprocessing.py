@@ -154,6 +154,7 @@ def test_rows_at_a_time_give_the_same_bits_as_all_at_once(monkeypatch: pytest.Mo
     assert torch.equal(by_strips, preprocess(photo, 512).pixels)
 
 
+@pytest.mark.slow
 def test_40_megapixels_take_less_memory_than_their_floats() -> None:
     script = (
         "import resource, numpy as np\n"

@@ -22,6 +22,8 @@ from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_spa
 from smust3r_colmap.evaluation.trajectory import Evaluation, compare_trajectories
 from smust3r_colmap.synthetic.room import write_demo
 
+pytestmark = pytest.mark.slow
+
 STAND_IN = Path(__file__).parents[2] / "data" / "must3r_stand_in.safetensors"
 NUM_IMAGES = 60
 

@@ -137,6 +137,7 @@ def test_the_checkpoint_stays_small() -> None:
     assert STAND_IN.stat().st_size < 5e6
 
 
+@pytest.mark.slow
 def test_depth_is_right_to_some_percent(network: Network, room: Room) -> None:
     errors = depth_errors(room, pointmaps_of(network, room, [0, 15]))
     assert 0.003 < np.median(errors) < 0.03
@@ -182,6 +183,7 @@ def test_confidence_tells_good_pixels_from_bad(network: Network, room: Room) -> 
     assert 1.5 * errors[trusted].mean() < errors[~trusted].mean()
 
 
+@pytest.mark.slow
 def test_a_room_it_never_saw_comes_out_wrong(network: Network) -> None:
     elsewhere = photograph(network, seed=1, numbers=range(0, NUM_IMAGES, 20))
     errors = depth_errors(elsewhere, pointmaps_of(network, elsewhere, [0, 3]))
@@ -221,6 +223,7 @@ def one_by_one(decoder: Decoder, features: Tensor) -> Tensor:
     return torch.stack((*pair.raw, *third.raw, *fourth.raw, *fifth.raw, *decoder.render(images[5:], memory)))
 
 
+@pytest.mark.slow
 def test_training_points_are_those_of_the_rendered_depth() -> None:
     scene = DemoScene()
     poses = scene.camera_path(5)
@@ -236,6 +239,7 @@ def test_training_points_are_those_of_the_rendered_depth() -> None:
     )
 
 
+@pytest.mark.slow
 def test_the_script_trains_and_writes_a_network_that_loads(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
