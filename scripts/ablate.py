@@ -52,9 +52,9 @@ from smust3r_colmap.execution.progress import QuietReporter
 from smust3r_colmap.geometry.groups import GROUPS
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.pipeline import reconstruct
-from smust3r_colmap.products import Edges, Segment
-from smust3r_colmap.segmentation.loop_segments import LoopPlan, PlannedLoop, plan_loops
-from smust3r_colmap.segmentation.stage import NOT_LOOKED_FOR
+from smust3r_colmap.products import Edges
+from smust3r_colmap.segmentation.loop_segments import plan_loops
+from smust3r_colmap.segmentation.stage import NOT_LOOKED_FOR, Segments
 from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.segmentation.windows import plan_windows
 from smust3r_colmap.stitching.camera_fusion import fuse_cameras
@@ -225,48 +225,48 @@ class Solved:
 
 def solve(
     result: BackboneResult,
-    segments: Sequence[Segment],
-    loops: Sequence[PlannedLoop],
+    segments: Segments,
     names: Sequence[str],
     config: RunConfig,
 ) -> Solved:
     """Alignment, loop closing and fusion of cameras as in ``pipeline``, without a run directory.
 
     Args:
-        result: of all segments. segments: windows and loops.
-        loops: as planned. names: of the images of the collection.
+        result: of all segments. segments: as planned.
+        names: of the images of the collection.
 
     Raises:
         DegenerateAlignmentError: a projective chain sends a camera to infinity.
     """
-    loop_segments = frozenset(segment.index for segment in segments if segment.kind == "loop")
     edges = align_submodels(
         result.submodels,
         result.dense,
         result.matches,
         config.alignment,
-        loop_segments=loop_segments,
+        next_windows=segments.next_windows,
+        loop_segments=segments.loop_indices,
         seed=config.seed,
         advance=lambda _: None,
     )
     stitching = stitch_submodels(
         result.submodels,
         edges.alignments,
-        loops,
+        segments.loops.loops,
+        segments.view_graph,
         group=GROUPS[config.alignment.transform_group],
         kernel=config.loop_closing.loop_kernel,
     )
-    before, _ = largest_trajectory(result, stitching.chained, loop_segments, names)
-    after, residual_px = largest_trajectory(result, stitching.parts, loop_segments, names)
+    before, _ = largest_trajectory(result, stitching.chained, segments, names)
+    after, residual_px = largest_trajectory(result, stitching.parts, segments, names)
     return Solved(edges=edges, stitching=stitching, before=before, after=after, residual_px=residual_px)
 
 
 def largest_trajectory(
-    result: BackboneResult, parts: Sequence[ChainedPart], loop_segments: frozenset[int], names: Sequence[str]
+    result: BackboneResult, parts: Sequence[ChainedPart], segments: Segments, names: Sequence[str]
 ) -> tuple[dict[str, np.ndarray], float]:
     """``world_from_cam`` by name of the part with most images, and its median residual in pixels."""
     part = max(parts, key=lambda part: len({image for p in part.submodels for image in result.submodels[p].images}))
-    cameras = fuse_cameras(placed_submodels(result, part, loop_segments))
+    cameras = fuse_cameras(placed_submodels(result, part, segments.loop_indices), segments.view_graph)
     trajectory = {
         names[image]: pose for image, pose in zip(cameras.images, invert_rigid(cameras.cam_from_world), strict=True)
     }
@@ -310,16 +310,15 @@ class OracleSet:
         config = replace(configuration.config, seed=seed)
         num_false = self.num_false_loops(config, configuration.false_share)
         backbone = self._backbone(config, num_false)
-        windows, plan = plan_segments(backbone, config)
-        segments = (*windows, *(loop.segment for loop in plan.loops))
-        result = backbone.reconstruct(segments, with_maps=range(len(segments)))
+        segments = plan_segments(backbone, config)
+        result = backbone.reconstruct(segments.all, with_maps=range(len(segments.all)))
         mislaid = {maps.submodel.segment for maps in oracle_maps(result) if maps.geometry.mislaid}
         started = time.process_time()
-        solved = solve(result, segments, plan.loops, self.truth.names, config)
+        solved = solve(result, segments, self.truth.names, config)
         seconds = time.process_time() - started
         truth = dict(zip(self.truth.names, self.truth.world_from_cam, strict=True))
         before, after = (compare_trajectories(one, truth) for one in (solved.before, solved.after))
-        false = [loop.segment.index in mislaid for loop in plan.loops]
+        false = [loop.segment.index in mislaid for loop in segments.loops.loops]
         accepted = [decision.accepted for decision in solved.stitching.decisions]
         sound = [edge for edge in solved.edges.alignments if edge.accepted]
         outcome = Outcome(
@@ -333,7 +332,7 @@ class OracleSet:
             fallbacks=sum(bool(edge.fallback) for edge in sound),
             edges=len(sound),
             residual_px=solved.residual_px,
-            found=len(plan.loops),
+            found=len(segments.loop_indices),
             closed=sum(accepted),
             found_false=sum(false),
             closed_false=sum(one and other for one, other in zip(false, accepted, strict=True)),
@@ -349,8 +348,8 @@ class OracleSet:
         """Places that only look alike, so that their part of all loops tried is as wanted, or what the scene has."""
         if share == 0:
             return 0
-        _, plan = plan_segments(self._backbone(config, 0), config)
-        wanted = math.ceil(len(plan.loops) * share / (1 - share))
+        segments = plan_segments(self._backbone(config, 0), config)
+        wanted = math.ceil(len(segments.loop_indices) * share / (1 - share))
         return next(number for number in range(wanted, -1, -1) if self._has_false_loops(config, number))
 
     def _has_false_loops(self, config: RunConfig, number: int) -> bool:
@@ -380,7 +379,7 @@ def with_drift_of_segments(errors: OracleSettings, length: int) -> OracleSetting
     )
 
 
-def plan_segments(backbone: OracleBackbone, config: RunConfig) -> tuple[tuple[Segment, ...], LoopPlan]:
+def plan_segments(backbone: OracleBackbone, config: RunConfig) -> Segments:
     """Windows, and the loops between them."""
     graph = ViewGraph.chain(len(backbone.collection))
     windows = plan_windows(
@@ -390,8 +389,8 @@ def plan_segments(backbone: OracleBackbone, config: RunConfig) -> tuple[tuple[Se
     )
     closing = config.loop_closing
     if not closing.loops:
-        return windows, NOT_LOOKED_FOR
-    return windows, plan_loops(
+        return Segments.of(graph, windows, NOT_LOOKED_FOR)
+    loops = plan_loops(
         backbone.describe(),
         graph,
         windows,
@@ -400,6 +399,7 @@ def plan_segments(backbone: OracleBackbone, config: RunConfig) -> tuple[tuple[Se
         min_distance=closing.loop_min_distance,
         half_width=closing.loop_half_width,
     )
+    return Segments.of(graph, windows, loops)
 
 
 def moved(trajectory: Trajectory, evaluation: Evaluation) -> Trajectory:

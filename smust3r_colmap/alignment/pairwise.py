@@ -25,6 +25,7 @@ from smust3r_colmap.alignment.uncertainty import inflated_information, overlap_c
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.estimators.confidence import ConfidenceWeighting
 from smust3r_colmap.estimators.robust import RobustKernel, RobustLoss, evenly_chosen
+from smust3r_colmap.geometry.arrays import Pair
 from smust3r_colmap.geometry.groups import GROUPS, TransformGroup, embed
 from smust3r_colmap.geometry.so3 import angles_between
 from smust3r_colmap.geometry.transform import Transform
@@ -93,6 +94,7 @@ def align_submodels(
     matches: InterSegmentMatches | None,
     options: AlignmentOptions,
     *,
+    next_windows: Collection[Pair],
     loop_segments: Collection[int] = (),
     seed: int,
     advance: Callable[[int], None],
@@ -107,13 +109,14 @@ def align_submodels(
         submodels: all of the run. dense: their maps, in the same order.
         matches: verified matches, for submodels that share too few images; None where there are none.
         options: group, kinds of edges, source of correspondences, loss, weighting.
+        next_windows: indices of the windows that follow each other, the lower one first.
         loop_segments: indices of the segments that are loops, not windows of the sequence.
         seed: of the searches for a robust start.
         advance: called with 1 after each pair of ``candidate_pairs``.
     """
     aligner = _Aligner(submodels=submodels, dense=dense, matches=matches, options=options, seed=seed)
     outcomes: list[SegmentAlignment | TriedAlignment] = []
-    for target, source in candidate_pairs(submodels, loop_segments):
+    for target, source in candidate_pairs(submodels, next_windows, loop_segments):
         outcomes += aligner.align(target, source)
         advance(1)
     return Edges(
@@ -129,16 +132,18 @@ def needs_maps(submodels: Sequence[Submodel], options: AlignmentOptions) -> bool
     )
 
 
-def candidate_pairs(submodels: Sequence[Submodel], loop_segments: Collection[int] = ()) -> tuple[tuple[int, int], ...]:
-    """Pairs that share an image, or belong to the same or to neighbouring windows; never two loops."""
+def candidate_pairs(
+    submodels: Sequence[Submodel], next_windows: Collection[Pair], loop_segments: Collection[int] = ()
+) -> tuple[tuple[int, int], ...]:
+    """Pairs that share an image, or belong to the same window or to two that follow each other; never two loops."""
     images = [set(submodel.images) for submodel in submodels]
     is_loop = [submodel.segment in loop_segments for submodel in submodels]
 
     def worth_it(a: int, b: int) -> bool:
         if is_loop[a] and is_loop[b]:
             return False
-        neighbours = not (is_loop[a] or is_loop[b]) and abs(submodels[a].segment - submodels[b].segment) <= 1
-        return neighbours or not images[a].isdisjoint(images[b])
+        first, second = sorted((submodels[a].segment, submodels[b].segment))
+        return first == second or (first, second) in next_windows or not images[a].isdisjoint(images[b])
 
     return tuple((a, b) for a, b in combinations(range(len(submodels)), 2) if worth_it(a, b))
 

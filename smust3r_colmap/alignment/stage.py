@@ -45,7 +45,7 @@ class EdgeSummary:
 
 def align(run: Run, result: BackboneResult, segments: Segments, options: AlignmentConfig) -> Edges:
     """Edges between all pairs of submodels that could have something in common."""
-    loops = segments.loop_indices
+    loops, next_windows = segments.loop_indices, segments.next_windows
     geometry = [(one.name, one.images, one.seg_from_cam, one.tracks) for one in result.submodels]
     maps = result.dense_key if needs_maps(result.submodels, options) else None
 
@@ -55,13 +55,14 @@ def align(run: Run, result: BackboneResult, segments: Segments, options: Alignme
             result.dense,
             result.matches,
             options,
+            next_windows=next_windows,
             loop_segments=loops,
             seed=run.seed,
             advance=progress.advance,
         )
 
-    inputs = (geometry, maps, result.matches, sorted(loops), options, run.seed)
-    num_pairs = len(candidate_pairs(result.submodels, loops))
+    inputs = (geometry, maps, result.matches, sorted(next_windows), sorted(loops), options, run.seed)
+    num_pairs = len(candidate_pairs(result.submodels, next_windows, loops))
     edges = run.cached("alignment", inputs, compute, _EDGES, total=num_pairs)
     fallbacks = [edge.fallback for edge in edges.alignments if edge.fallback]
     if fallbacks:

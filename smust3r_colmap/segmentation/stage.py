@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 from smust3r_colmap.config import LoopConfig, SegmentationConfig
 from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.execution.run_context import Run
-from smust3r_colmap.geometry.arrays import Float32Array
+from smust3r_colmap.geometry.arrays import Float32Array, Pair
 from smust3r_colmap.products import Segment
 from smust3r_colmap.segmentation.loop_segments import LoopPlan, plan_loops
 from smust3r_colmap.segmentation.view_graph import ViewGraph
@@ -42,6 +43,13 @@ class Segments:
             if not self.view_graph.are_neighbours(loop.image_a, loop.image_b):
                 raise ValueError(f"Segments: loop ({loop.image_a}, {loop.image_b}) is no pair of the view graph")
 
+    @classmethod
+    def of(cls, graph: ViewGraph, windows: tuple[Segment, ...], loops: LoopPlan) -> Segments:
+        """Windows and loops of the images of a graph, to which the ends of the loops are added."""
+        ends = [(loop.image_a, loop.image_b) for loop in loops.loops]
+        known = graph.with_pairs(ends, "retrieval", weights=[loop.similarity for loop in loops.loops])
+        return cls(view_graph=known, windows=windows, loops=loops)
+
     @property
     def all(self) -> tuple[Segment, ...]:
         """Windows and loop segments, each at its index."""
@@ -51,6 +59,15 @@ class Segments:
     def loop_indices(self) -> frozenset[int]:
         """Indices of the loop segments."""
         return frozenset(loop.segment.index for loop in self.loops.loops)
+
+    @property
+    def next_windows(self) -> frozenset[Pair]:
+        """Indices of every window and the next one of the same sequence, with which it shares images."""
+        return frozenset(
+            (one.index, after.index)
+            for one, after in pairwise(self.windows)
+            if not set(one.images).isdisjoint(after.images)
+        )
 
 
 def plan(
@@ -68,7 +85,7 @@ def plan(
     graph = ViewGraph.chain(num_images)
     windows = plan_windows(graph, segment_length=segmentation.segment_length, overlap=segmentation.overlap)
     if not loop_closing.loops:
-        return Segments(view_graph=graph, windows=windows, loops=NOT_LOOKED_FOR)
+        return Segments.of(graph, windows, NOT_LOOKED_FOR)
     descriptors = describe()
 
     def compute(progress: Stage) -> LoopPlan:
@@ -84,10 +101,5 @@ def plan(
         progress.advance()
         return planned
 
-    loops = run.cached("loops", (descriptors, graph, windows, loop_closing), compute, _LOOPS)
-    found = graph.with_pairs(
-        [(loop.image_a, loop.image_b) for loop in loops.loops],
-        "retrieval",
-        weights=[loop.similarity for loop in loops.loops],
-    )
-    return Segments(view_graph=found, windows=windows, loops=loops)
+    inputs = (descriptors, graph, windows, loop_closing)
+    return Segments.of(graph, windows, run.cached("loops", inputs, compute, _LOOPS))

@@ -15,6 +15,7 @@ from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.geometry.so3 import angles_between, nearest_rotation
 from smust3r_colmap.products import DenseMaps, ImageCollection, PointCloud, Scene
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.stitching.resection import PlacedSubmodel
 
 MAX_DISAGREEMENT_RATIO = 5.0
@@ -77,7 +78,7 @@ class _ImagePoses:
         return distances, np.rad2deg(angles_between(rotations[:, None], rotations[None]))
 
 
-def fuse_cameras(submodels: Sequence[PlacedSubmodel]) -> FusedCameras:
+def fuse_cameras(submodels: Sequence[PlacedSubmodel], view_graph: ViewGraph) -> FusedCameras:
     """One pose per image: centres by weighted mean, rotations by weighted chordal mean.
 
     The weights are the ``support_weights`` of each submodel, so through an overlap the trajectory passes
@@ -90,6 +91,7 @@ def fuse_cameras(submodels: Sequence[PlacedSubmodel]) -> FusedCameras:
 
     Args:
         submodels: of one connected part, placed in its world.
+        view_graph: the order of the images.
 
     Raises:
         ValueError: no submodel.
@@ -98,7 +100,7 @@ def fuse_cameras(submodels: Sequence[PlacedSubmodel]) -> FusedCameras:
     """
     if not submodels:
         raise ValueError("fusion: no submodel, needed at least one")
-    all_poses = _poses_by_image(submodels)
+    all_poses = _poses_by_image(submodels, view_graph)
     centres = np.concatenate([poses.world_from_cam[:, :, 3] for poses in all_poses.values()])
     radius = float(np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
     median = _median_disagreement(all_poses.values(), radius)
@@ -136,20 +138,19 @@ def fuse_cameras(submodels: Sequence[PlacedSubmodel]) -> FusedCameras:
     )
 
 
-def support_weights(images: Sequence[int]) -> FloatArray:
+def support_weights(images: Sequence[int], view_graph: ViewGraph) -> FloatArray:
     """(N,) weight of each image of a submodel, in (0, 1]: falls linearly from the middle of its run to the ends.
 
     An image in the middle of a run has neighbours on both sides, one at its end on one side only. A
     run ends where more than ``MAX_GAP_IMAGES`` images are missing.
 
     Args:
-        images: indices into the collection, ascending.
+        images: indices into the collection.
+        view_graph: their order.
     """
-    ends = np.flatnonzero(np.diff(images) > MAX_GAP_IMAGES + 1) + 1
-    runs = [np.arange(len(run)) for run in np.split(np.asarray(images), ends)]
-    to_end = np.concatenate([np.minimum(run, run[::-1]) + 1 for run in runs])
-    weights: FloatArray = to_end / to_end.max()
-    return weights
+    runs = view_graph.runs(images, max_steps=MAX_GAP_IMAGES + 1)
+    to_end = {image: 1 + min(k, len(run) - 1 - k) for run in runs for k, image in enumerate(run)}
+    return np.array([to_end[image] for image in images]) / max(to_end.values())
 
 
 def supported_images(submodels: Sequence[PlacedSubmodel]) -> list[npt.NDArray[np.bool_]]:
@@ -161,11 +162,11 @@ def supported_images(submodels: Sequence[PlacedSubmodel]) -> list[npt.NDArray[np
     ]
 
 
-def _poses_by_image(submodels: Sequence[PlacedSubmodel]) -> dict[int, _ImagePoses]:
+def _poses_by_image(submodels: Sequence[PlacedSubmodel], view_graph: ViewGraph) -> dict[int, _ImagePoses]:
     """Per image, ascending, its pose in each submodel that supports it."""
     found: dict[int, list[tuple[int, FloatArray, float]]] = defaultdict(list)
     for position, (placed, supported) in enumerate(zip(submodels, supported_images(submodels), strict=True)):
-        weights = support_weights(placed.submodel.images)
+        weights = support_weights(placed.submodel.images, view_graph)
         for k in np.flatnonzero(supported):
             found[placed.submodel.images[k]].append((position, placed.world_from_cam[k], weights[k]))
     return {

@@ -20,8 +20,9 @@ import numpy as np
 
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.transform import Transform
-from smust3r_colmap.products import SegmentAlignment, Submodel, consecutive_runs
+from smust3r_colmap.products import SegmentAlignment, Submodel
 from smust3r_colmap.segmentation.loop_segments import PlannedLoop
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.stitching.spanning_tree import ChainedPart
 
 MIN_END_IMAGES = 3
@@ -93,6 +94,7 @@ def verify_loops(
     submodels: Sequence[Submodel],
     alignments: Sequence[SegmentAlignment],
     chained: Sequence[ChainedPart],
+    view_graph: ViewGraph,
 ) -> tuple[LoopDecision, ...]:
     """One decision per loop, each on its own.
 
@@ -101,15 +103,20 @@ def verify_loops(
         submodels: of windows and loop segments.
         alignments: between them; only accepted ones count.
         chained: the windows without any loop.
+        view_graph: the order of the images, which cuts a loop segment into its ends.
     """
     chain = _Chain(alignments, chained)
-    return tuple(_verify(loop, submodels, alignments, chain) for loop in loops)
+    return tuple(_verify(loop, view_graph.runs(loop.segment.images), submodels, alignments, chain) for loop in loops)
 
 
 def _verify(
-    loop: PlannedLoop, submodels: Sequence[Submodel], alignments: Sequence[SegmentAlignment], chain: _Chain
+    loop: PlannedLoop,
+    runs: Sequence[Sequence[int]],
+    submodels: Sequence[Submodel],
+    alignments: Sequence[SegmentAlignment],
+    chain: _Chain,
 ) -> LoopDecision:
-    ends = [set(run) for run in consecutive_runs(loop.segment.images)]
+    ends = [set(run) for run in runs]
     own = [k for k, submodel in enumerate(submodels) if submodel.segment == loop.segment.index]
     held = {k: [len(end & set(submodels[k].images)) for end in ends] for k in own}
     if not own or max(min(counts) for counts in held.values()) < MIN_END_IMAGES:

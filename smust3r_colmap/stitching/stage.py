@@ -171,6 +171,7 @@ def stitch(
             result.submodels,
             edges.alignments,
             segments.loops.loops,
+            segments.view_graph,
             group=GROUPS[alignment.transform_group],
             kernel=loop_closing.loop_kernel,
         )
@@ -207,7 +208,7 @@ def _place(
         maps = DepthMapWriter(folder)
         for part in sorted(parts, key=lambda part: _num_images(part, result), reverse=True):
             placed = _placed(part, result, segments)
-            cameras = fuse_cameras(placed)
+            cameras = fuse_cameras(placed, segments.view_graph)
             found.append(PlacedScene(scene=_scene(placed, cameras, result, collection), cameras=cameras))
             dense = [result.dense[p] for p in part.submodels]
             for image, depth, confidence in depth_in_cameras(placed, dense, cameras):
@@ -237,7 +238,7 @@ def _without_loops(
     except DegenerateAlignmentError as error:
         run.clock.note(f"no trajectory without loops: {error}")
         return None
-    return _scene(placed, fuse_cameras(placed), result, collection)
+    return _scene(placed, fuse_cameras(placed, segments.view_graph), result, collection)
 
 
 def _num_images(part: ChainedPart, result: BackboneResult) -> int:

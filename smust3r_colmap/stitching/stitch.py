@@ -18,6 +18,7 @@ from smust3r_colmap.geometry.so3 import angles_between
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import SegmentAlignment, Submodel
 from smust3r_colmap.segmentation.loop_segments import PlannedLoop
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.stitching.loop_verification import LoopDecision, verify_loops
 from smust3r_colmap.stitching.pose_graph.graph import ODOMETRY, PoseGraph
 from smust3r_colmap.stitching.pose_graph.optimise import GraphSolution, Kernel, optimise
@@ -67,6 +68,7 @@ def stitch_submodels(
     submodels: Sequence[Submodel],
     alignments: Sequence[SegmentAlignment],
     loops: Sequence[PlannedLoop],
+    view_graph: ViewGraph,
     *,
     group: type[Transform],
     kernel: Kernel,
@@ -77,13 +79,14 @@ def stitch_submodels(
         submodels: of windows and loop segments.
         alignments: between them, all in the group; only accepted ones are used.
         loops: as planned.
+        view_graph: of the images.
         group: of all transforms.
         kernel: what keeps a false loop from bending the graph.
     """
     loop_segments = {loop.segment.index for loop in loops}
     windows = [k for k, submodel in enumerate(submodels) if submodel.segment not in loop_segments]
     chained = chain_submodels(windows, alignments, group=group)
-    decisions = list(verify_loops(loops, submodels, alignments, chained))
+    decisions = list(verify_loops(loops, submodels, alignments, chained, view_graph))
     accepted = [number for number, one in enumerate(decisions) if one.accepted]
     loop_submodels = {_submodel(decisions[number]): k for k, number in enumerate(accepted)}
     start = chain_submodels([*windows, *loop_submodels], alignments, loops=loop_submodels, group=group)

@@ -39,7 +39,7 @@ def align(
     a: Submodel, b: Submodel, matches: InterSegmentMatches | None = None, *, edges: AlignmentEdges = "points"
 ) -> Edges:
     settings = AlignmentConfig(alignment_edges=edges)
-    return align_submodels([a, b], [], matches, settings, seed=0, advance=Counter())
+    return align_submodels([a, b], [], matches, settings, next_windows={(0, 1)}, seed=0, advance=Counter())
 
 
 def test_submodels_that_share_images_are_joined_by_their_tracks() -> None:
@@ -120,7 +120,7 @@ def test_only_submodels_that_could_meet_are_tried() -> None:
         return make_submodel(world_from_cam, tuple(images), points, Sim3.identity(), segment=segment)
 
     submodels = [submodel(range(4), 0), submodel(range(6, 10), 1), submodel(range(12, 16), 2), submodel(range(2, 6), 5)]
-    assert candidate_pairs(submodels) == ((0, 1), (0, 3), (1, 2))
+    assert candidate_pairs(submodels, {(0, 1), (1, 2)}) == ((0, 1), (0, 3), (1, 2))
 
 
 def test_edges_come_back_from_disk_as_they_were(tmp_path) -> None:  # type: ignore[no-untyped-def]
@@ -182,9 +182,9 @@ def test_two_loops_are_never_aligned_and_no_loop_by_its_number() -> None:
         submodel((2, 3, 14), 2),
         submodel((3, 4, 15), 3),
     ]
-    assert candidate_pairs(submodels, {2, 3}) == ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3))
+    assert candidate_pairs(submodels, {(0, 1)}, {2, 3}) == ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3))
     lonely = submodel((8, 9), 2)
-    assert candidate_pairs([*submodels[:2], lonely], {2}) == ((0, 1),)
+    assert candidate_pairs([*submodels[:2], lonely], {(0, 1)}, {2}) == ((0, 1),)
 
 
 @pytest.mark.parametrize("group", ["sim3", "se3", "affine3", "sl4"])
@@ -195,7 +195,7 @@ def test_all_edges_of_a_run_are_in_its_group(group: TransformGroup) -> None:
     a = make_submodel(world_from_cam, tuple(range(12)), points, Sim3.identity())
     b = make_submodel(world_from_cam, tuple(range(6, 18)), points, turned, segment=1)
     settings = AlignmentConfig(transform_group=group)
-    found = align_submodels([a, b], [], None, settings, seed=0, advance=Counter()).alignments
+    found = align_submodels([a, b], [], None, settings, next_windows={(0, 1)}, seed=0, advance=Counter()).alignments
     assert [edge.evidence for edge in found] == ["tracks", "poses"]
     for edge in found:
         assert edge.accepted, edge.reason
@@ -207,7 +207,7 @@ def test_all_edges_of_a_run_are_in_its_group(group: TransformGroup) -> None:
 def test_edges_a_stretched_half_turn_apart_deny_each_other() -> None:
     a, b, _ = two_submodels(range(12), range(6, 18))
     settings = AlignmentConfig(transform_group="affine3", alignment_edges="points")
-    (edge,) = align_submodels([a, b], [], None, settings, seed=0, advance=Counter()).alignments
+    (edge,) = align_submodels([a, b], [], None, settings, next_windows={(0, 1)}, seed=0, advance=Counter()).alignments
     half_turn = Affine3.from_matrix(np.diag([-1.1, -0.9, 1.0, 1.0]))
     turned = replace(edge, estimate=replace(edge.estimate, b_from_a=edge.estimate.b_from_a @ half_turn))
     assert disagreement_sigmas(edge, edge) == pytest.approx(0.0, abs=1e-6)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers.sphere_world import (
     NUM_IMAGES,
+    ORDER,
     MapsInMemory,
     World,
     make_submodel,
@@ -295,7 +296,7 @@ def test_cloud_takes_pixels_of_a_loop_submodel_only_for_its_own_images() -> None
     placed = world.placed(loops=[2])
 
     def num_pixels(world: World, placed: Sequence[PlacedSubmodel]) -> int:
-        cameras = fuse_cameras(placed)
+        cameras = fuse_cameras(placed, ORDER)
         return fuse_points(placed, world.dense, cameras, max_points=20_000, min_confidence=2.0).statistics.num_pixels
 
     ends = sum(np.count_nonzero(world.dense[2].confidences[k] >= 2) for k in (0, 5))

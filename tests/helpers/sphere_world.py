@@ -15,11 +15,13 @@ from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres, pointmap_f
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import DenseMaps, Submodel
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.stitching.camera_fusion import FusedCameras, fuse_cameras
 from smust3r_colmap.stitching.resection import PlacedSubmodel, place_submodel
 
 CAMERA = Intrinsics(model="SIMPLE_RADIAL", width=640, height=480, params=(600, 320, 240, -0.05))
 NUM_IMAGES = 14
+ORDER = ViewGraph.chain(100)
 WINDOWS = (range(0, 7), range(3, 10), range(7, 14))
 MAP_SIZES = ((48, 36), (64, 48))  # maps of different images may differ in size
 
@@ -85,7 +87,7 @@ class World:
         return [place_submodel(*part, is_loop=position in loops) for position, part in enumerate(parts)]
 
     def cameras(self) -> FusedCameras:
-        return fuse_cameras(self.placed())
+        return fuse_cameras(self.placed(), ORDER)
 
     def points(self, *, max_points: int = 20_000, min_confidence: float = 2.0) -> FusedPoints:
         maps: Sequence[DenseMaps] = self.dense

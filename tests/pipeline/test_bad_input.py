@@ -18,8 +18,8 @@ from smust3r_colmap.config import RunConfig, SegmentationConfig, TransformGroup
 from smust3r_colmap.evaluation.trajectory import Evaluation, compare_trajectories
 from smust3r_colmap.geometry.arrays import Float32Array
 from smust3r_colmap.geometry.sim3 import Sim3
-from smust3r_colmap.products import DenseMaps, Segment, SegmentAlignment, SegmentReconstruction, Submodel
-from smust3r_colmap.segmentation.loop_segments import PlannedLoop
+from smust3r_colmap.products import DenseMaps, SegmentAlignment, SegmentReconstruction, Submodel
+from smust3r_colmap.segmentation.stage import Segments
 from smust3r_colmap.stitching.stitch import stitch_submodels
 from smust3r_colmap.synthetic.backbone import OracleBackbone
 from smust3r_colmap.synthetic.settings import PRESETS, OracleSettings
@@ -113,19 +113,17 @@ class Run:
     truth: TrueScene
     config: RunConfig
     result: BackboneResult
-    loops: tuple[PlannedLoop, ...]
-    segments: tuple[Segment, ...]
+    segments: Segments
 
     def solved(self) -> ablate.Solved:
-        return ablate.solve(self.result, self.segments, self.loops, self.truth.names, self.config)
+        return ablate.solve(self.result, self.segments, self.truth.names, self.config)
 
 
 def simulated(truth: TrueScene, config: RunConfig = CONFIG, settings: OracleSettings = NETWORK) -> Run:
     backbone = OracleBackbone(truth, collection_of(truth), settings, seed=0)
-    windows, plan = ablate.plan_segments(backbone, config)
-    segments = (*windows, *(loop.segment for loop in plan.loops))
-    result = backbone.reconstruct(segments, with_maps=range(len(segments)))
-    return Run(truth=truth, config=config, result=result, loops=plan.loops, segments=segments)
+    segments = ablate.plan_segments(backbone, config)
+    result = backbone.reconstruct(segments.all, with_maps=range(len(segments.all)))
+    return Run(truth=truth, config=config, result=result, segments=segments)
 
 
 def spoilt(run: Run, change: Change, submodels: Sequence[int] | None = None) -> Run:
@@ -181,7 +179,7 @@ def test_an_unspoilt_round_is_sound_and_its_loop_closes(
 
 def test_a_path_that_never_comes_back_plans_no_loop(truth: TrueScene) -> None:
     run = simulated(some_of(truth, range(NUM_IMAGES // 2)))
-    assert run.loops == ()
+    assert run.segments.loop_indices == set()
     solved = run.solved()
     assert_sound(run, solved)
     assert solved.stitching.decisions == ()
@@ -189,7 +187,7 @@ def test_a_path_that_never_comes_back_plans_no_loop(truth: TrueScene) -> None:
 
 def test_a_camera_that_stands_still_is_chained_by_its_points_and_closes_nothing(truth: TrueScene) -> None:
     run = simulated(some_of(truth, [5] * 40))
-    assert run.loops == ()
+    assert run.segments.loop_indices == set()
     solved = run.solved()
     assert len(solved.after) == 40
     centres = np.array([pose[:, 3] for pose in solved.after.values()])
@@ -229,10 +227,9 @@ def test_segments_without_a_common_image_become_parts_that_are_solved_each_by_it
     run = with_submodel(run, 3, cut, SpoiltMaps(run.result.dense[3], half, lambda *maps: maps))
     solved = run.solved()
     assert [part.submodels for part in solved.stitching.parts] == [(0, 1, 2), (3, 4, 5, 6)]
-    loops: frozenset[int] = frozenset()
     for part in solved.stitching.parts:
         np.testing.assert_allclose(part.world_from_seg[0].matrix, np.eye(4), atol=1e-12)
-        trajectory, _ = ablate.largest_trajectory(run.result, [part], loops, truth.names)
+        trajectory, _ = ablate.largest_trajectory(run.result, [part], run.segments, truth.names)
         found = compare_trajectories(trajectory, dict(zip(truth.names, truth.world_from_cam, strict=True)))
         assert 0.01 < found.position_rmse_percent < SOUND_PERCENT
 
@@ -330,12 +327,12 @@ def test_trusted_edges_that_contradict_each_other_end_in_a_finite_compromise(tru
     alignments = list(solved.edges.alignments)
     position = next(k for k, edge in enumerate(alignments) if edge.source - edge.target == 2)
     alignments[position] = _turned(alignments[position])
-    found = stitch_submodels(run.result.submodels, alignments, (), group=Sim3, kernel="cauchy")
+    found = stitch_submodels(run.result.submodels, alignments, (), run.segments.view_graph, group=Sim3, kernel="cauchy")
     assert found.solution.cost_after < found.solution.cost_before
     assert found.solution.cost_after > 10 * solved.stitching.solution.cost_after
     (part,) = found.parts
     assert np.isfinite([frame.matrix for frame in part.world_from_seg]).all()
-    trajectory, _ = ablate.largest_trajectory(run.result, [part], frozenset(), truth.names)
+    trajectory, _ = ablate.largest_trajectory(run.result, [part], run.segments, truth.names)
     error = compare_trajectories(trajectory, dict(zip(truth.names, truth.world_from_cam, strict=True)))
     assert error.position_rmse_percent < 10 * SOUND_PERCENT
 

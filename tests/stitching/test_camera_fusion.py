@@ -10,6 +10,7 @@ import pytest
 from helpers.sphere_world import (
     CAMERA,
     NUM_IMAGES,
+    ORDER,
     WINDOWS,
     make_submodel,
     make_world,
@@ -43,16 +44,16 @@ def test_exact_submodels_give_back_the_exact_cameras() -> None:
 
 
 def test_weights_fall_to_the_ends_of_a_submodel() -> None:
-    np.testing.assert_allclose(support_weights(range(5)), [1 / 3, 2 / 3, 1, 2 / 3, 1 / 3])
-    np.testing.assert_allclose(support_weights(range(7, 11)), [0.5, 1, 1, 0.5])
-    np.testing.assert_allclose(support_weights([3]), [1])
+    np.testing.assert_allclose(support_weights(range(5), ORDER), [1 / 3, 2 / 3, 1, 2 / 3, 1 / 3])
+    np.testing.assert_allclose(support_weights(range(7, 11), ORDER), [0.5, 1, 1, 0.5])
+    np.testing.assert_allclose(support_weights([3], ORDER), [1])
 
 
 def test_weights_fall_to_the_ends_of_each_run_but_not_at_a_few_missing_images() -> None:
     two_runs = [10, 11, 12, 90, 91, 92, 93, 94]
-    np.testing.assert_allclose(support_weights(two_runs), np.array([1, 2, 1, 1, 2, 3, 2, 1]) / 3)
-    np.testing.assert_allclose(support_weights([0, 1, 7, 8]), [0.5, 1, 1, 0.5])
-    np.testing.assert_allclose(support_weights([0, 1, 8, 9]), [1, 1, 1, 1])
+    np.testing.assert_allclose(support_weights(two_runs, ORDER), np.array([1, 2, 1, 1, 2, 3, 2, 1]) / 3)
+    np.testing.assert_allclose(support_weights([0, 1, 7, 8], ORDER), [0.5, 1, 1, 0.5])
+    np.testing.assert_allclose(support_weights([0, 1, 8, 9], ORDER), [1, 1, 1, 1])
 
 
 def test_drift_is_averaged_steadily_from_one_submodel_to_the_next() -> None:
@@ -88,7 +89,7 @@ def test_one_bad_pose_is_dropped_where_the_other_submodel_has_the_larger_weight(
 def test_two_of_three_submodels_outweigh_the_one_of_largest_weight() -> None:
     exact = make_world((range(0, 8), range(2, 10), range(4, 14), range(1, 5)))
     world = moved(exact, 1, 6, (0.5, 0, 0), 10)
-    assert support_weights(range(8))[4] > support_weights(range(8))[1], (
+    assert support_weights(range(8), ORDER)[4] > support_weights(range(8), ORDER)[1], (
         "the bad submodel holds image 6 more central than the first"
     )
     cameras = world.cameras()
@@ -145,7 +146,7 @@ def test_submodels_that_disagree_everywhere_are_averaged_and_the_spread_shows_it
 
 def test_fusing_needs_a_submodel() -> None:
     with pytest.raises(ValueError, match="no submodel, needed at least one"):
-        fuse_cameras([])
+        fuse_cameras([], ORDER)
 
 
 # ------------------------------------------------------------------------------- loops
@@ -155,18 +156,18 @@ LOOP = (0, 1, 2, 11, 12, 13)
 def test_loop_submodel_has_no_weight_where_a_window_placed_the_image() -> None:
     without = make_world()
     world = shifted(make_world((*WINDOWS, LOOP)), 3, (0.1, 0, 0))
-    cameras = fuse_cameras(world.placed(loops=[3]))
+    cameras = fuse_cameras(world.placed(loops=[3]), ORDER)
     np.testing.assert_array_equal(cameras.cam_from_world, without.cameras().cam_from_world)
     np.testing.assert_array_equal(cameras.num_submodels, without.cameras().num_submodels)
     np.testing.assert_array_equal(cameras.best_submodel, without.cameras().best_submodel)
-    as_window = fuse_cameras(world.placed())
+    as_window = fuse_cameras(world.placed(), ORDER)
     assert np.abs(as_window.cam_from_world - cameras.cam_from_world).max() > 0.01
 
 
 def test_loop_submodel_places_the_images_that_no_window_holds() -> None:
     exact = make_world((range(1, 8), range(4, 13), LOOP))
     world = moved(exact, 2, 13, (0.1, 0, 0))
-    cameras = fuse_cameras(world.placed(loops=[2]))
+    cameras = fuse_cameras(world.placed(loops=[2]), ORDER)
     assert cameras.images == tuple(range(14))
     assert cameras.best_submodel[[0, 13]].tolist() == [2, 2]
     assert 2 not in cameras.best_submodel[1:13]

@@ -34,6 +34,7 @@ from smust3r_colmap.stitching.stitch import ClosureGap, Stitching, closure_gap, 
 from smust3r_colmap.storage.dense_maps import EmptyMaps
 
 NUM_IMAGES, LENGTH, STEP = 96, 16, 8
+ORDER = ViewGraph.chain(NUM_IMAGES)
 SIGMA = np.array([0.02, 0.02, 0.02, 0.01, 0.01, 0.01, 0.01])
 """Of an edge: shift, turn, log scale."""
 RADIUS = 5.0
@@ -133,7 +134,7 @@ class Ring:
                 self.add_edge(window, self.add_submodel(end, segment.index))
 
     def stitched(self) -> Stitching:
-        return stitch_submodels(self.submodels, self.edges, self.loops, group=Sim3, kernel="cauchy")
+        return stitch_submodels(self.submodels, self.edges, self.loops, ORDER, group=Sim3, kernel="cauchy")
 
     def error(self, stitching: Stitching, *, closed: bool) -> float:
         """Root mean square distance of all window cameras from the truth, the first submodel held."""
@@ -261,7 +262,7 @@ def test_two_edges_of_a_pair_are_averaged_by_their_information() -> None:
         estimate=replace(first.estimate, b_from_a=first.estimate.b_from_a @ shifted),
         information=first.information / 2,
     )
-    found = stitch_submodels(ring.submodels[:2], [first, second], [], group=Sim3, kernel="cauchy")
+    found = stitch_submodels(ring.submodels[:2], [first, second], [], ORDER, group=Sim3, kernel="cauchy")
     between = first.estimate.b_from_a.inverse() @ found.parts[0].world_from_seg[1]
     np.testing.assert_allclose(between.log(), [0.001, 0, 0, 0, 0, 0, 0], atol=1e-6)
 
@@ -318,7 +319,7 @@ def test_the_gap_of_a_camera_that_only_turns_has_no_distance() -> None:
     submodels = [replace(submodel, seg_from_cam=submodel.seg_from_cam * [1, 1, 1, 0]) for submodel in ring.submodels]
     same = [replace(edge.estimate, b_from_a=Sim3.identity()) for edge in ring.edges]
     edges = [replace(edge, estimate=estimate) for edge, estimate in zip(ring.edges, same, strict=True)]
-    (part,) = stitch_submodels(submodels[:-1], edges[:-2], [], group=Sim3, kernel="none").chained
+    (part,) = stitch_submodels(submodels[:-1], edges[:-2], [], ORDER, group=Sim3, kernel="none").chained
     decision = LoopDecision(submodel=11, accepted=True, edges=(10, 11))
     assert np.isnan(closure_gap(decision, submodels, edges, [part]).distance)
 
@@ -344,6 +345,6 @@ def test_a_chain_that_cannot_be_drawn_costs_the_comparison_and_not_the_run(
 
     monkeypatch.setattr(stitching_stage, "place_submodel", beyond_infinity)
     collection = ImageCollection(images=(), cameras=())
-    segments = Segments(view_graph=ViewGraph.chain(0), windows=(), loops=NOT_LOOKED_FOR)
+    segments = Segments(view_graph=ORDER, windows=(), loops=NOT_LOOKED_FOR)
     with quiet_run(tmp_path / "out") as run:
         assert stitching_stage._without_loops(run, result, segments, found.chained, collection) is None
