@@ -3,7 +3,7 @@
 Splat trainers read PINHOLE cameras only, and most of them ignore the principal point. COLMAP's undistortion
 keeps it where the calibration has it, so the view is cut to lie evenly round it. Both steps are one lookup:
 resampling twice would blur twice, and a cut by whole pixels would leave the point half a pixel off.
-The next module to read is ``trainer_selection``.
+The next module to read is ``training_selection``.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ the centre of that pixel, which lies at (j + 0.5, i + 0.5) for the cameras of th
 which moves the cameras when it reads them, and for COLMAP's fusion, which does not: see ``_fuse``.
 
 Images are as large as the maps, because readers compare the two: COLMAP resizes the camera to the map, others refuse
-maps of another size. What is to be trained or textured at full resolution starts from the trainer folder.
+maps of another size. What is to be trained or textured at full resolution starts from the training dataset.
 The next module to read is ``mesh``.
 """
 
@@ -57,30 +57,30 @@ WORKSPACE_ENTRIES = frozenset(
 )
 """What an older workspace may hold and is replaced with it."""
 
-NORMAL_RADIUS = 3
+NORMAL_RADIUS_PX = 3
 """Pixels round a pixel whose depth makes its normal. Depth of neighbouring pixels scatters by about a percent, which
 over one pixel's width turns a normal by 45 degrees, and over seven by a few."""
-NORMAL_MIN_PIXELS = 8
+MIN_NORMAL_PIXELS = 8
 """Pixels on the same surface that a normal needs."""
-SAME_SURFACE = 0.05
+SAME_SURFACE_RELATIVE_DEPTH = 0.05
 """Relative difference of depth up to which two pixels of a window are one surface."""
 
-FUSED_VIEWS = 3
+MIN_FUSED_VIEWS = 3
 """Pixels per fused point (COLMAP: 5). Every depth here has been confirmed by two other views, and maps of small
 images seen once per place have no five."""
-FUSED_DEPTH_ERROR = 0.02
+FUSED_RELATIVE_DEPTH_ERROR = 0.02
 """Relative (COLMAP: 0.01); what two views had to agree within to be kept."""
 FUSED_REPROJECTION_PX = 1.0
 """COLMAP: 2, for maps of full size. Two pixels of a small map are a large patch: of a courtyard in 30 maps of 384
 pixels 87,000 points were left instead of 158,000, and their normals scattered by a third more."""
 FUSED_NORMAL_ERROR_DEG = 30.0
 """COLMAP: 10, for normals that patch match optimises; ours are fitted to depth and noisier."""
-FUSED_CHECKED_IMAGES = 30
+MAX_FUSED_NEIGHBOURS = 30
 """Neighbours that a point is traced through (COLMAP: 50), which bounds memory and time on long sequences."""
 BYTES_PER_FUSED_PIXEL = 24
 """Depth, normal, colour and the mask of pixels used, in stereo fusion."""
 
-_COPY_QUALITY = 95
+_COPY_JPEG_QUALITY = 95
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -296,7 +296,7 @@ def _lay_out(model: pycolmap.Reconstruction, images: Path, sources: Sequence[_So
             camera=0,
             digest="",
         )
-        Image.fromarray(load_rgb(file)).save(place, quality=_COPY_QUALITY)
+        Image.fromarray(load_rgb(file)).save(place, quality=_COPY_JPEG_QUALITY)
     renamed.write_binary(inputs / "model")
 
 
@@ -347,8 +347,8 @@ def normals_of_depth(depth: FloatMap, img_from_cam: FloatArray) -> FloatMap:
     """Unit normals (H, W, 3) float32 in the camera's axes, facing the camera; zero where there is no depth.
 
     The inverse depth of a plane n . x = 1 is n . ray, which is linear in the pixel's place: a x + b y + c. It is
-    fitted by least squares to the window of ``NORMAL_RADIUS`` round each pixel, to the pixels of the same surface only,
-    and (a, b, c) = n img_from_cam^-1 gives n. Pixels with fewer than ``NORMAL_MIN_PIXELS`` such neighbours, or with
+    fitted by least squares to the pixels of the same surface in the window of ``NORMAL_RADIUS_PX`` round each pixel,
+    and (a, b, c) = n img_from_cam^-1 gives n. Pixels with fewer than ``MIN_NORMAL_PIXELS`` such neighbours, or with
     all of them on a line, face the camera.
 
     Args:
@@ -376,17 +376,17 @@ def normals_of_depth(depth: FloatMap, img_from_cam: FloatArray) -> FloatMap:
 def _window_sums(inverse: FloatMap, known: npt.NDArray[np.bool_]) -> FloatMap:
     """(9, H, W) sums over each window of 1, dx, dy, dx dx, dx dy, dy dy, d, dx d, dy d with d the change of 1 / depth.
 
-    Only pixels whose inverse depth differs from the middle's by at most ``SAME_SURFACE`` of it count.
+    Only pixels whose inverse depth differs from the middle's by at most ``SAME_SURFACE_RELATIVE_DEPTH`` of it count.
     """
     height, width = inverse.shape
-    padded = np.pad(inverse, NORMAL_RADIUS)
-    tolerance = np.where(known, np.float32(SAME_SURFACE) * inverse, np.float32(-1))
+    padded = np.pad(inverse, NORMAL_RADIUS_PX)
+    tolerance = np.where(known, np.float32(SAME_SURFACE_RELATIVE_DEPTH) * inverse, np.float32(-1))
     sums = np.zeros((9, height, width), np.float32)
-    for dy in range(-NORMAL_RADIUS, NORMAL_RADIUS + 1):
+    for dy in range(-NORMAL_RADIUS_PX, NORMAL_RADIUS_PX + 1):
         # Sums over one row of the window, of 1, dx, dx dx and of d, dx d; its counts fit 8 bits.
         counts, changes = np.zeros((3, height, width), np.int8), np.zeros((2, height, width), np.float32)
-        for dx in range(-NORMAL_RADIUS, NORMAL_RADIUS + 1):
-            top, left = NORMAL_RADIUS + dy, NORMAL_RADIUS + dx
+        for dx in range(-NORMAL_RADIUS_PX, NORMAL_RADIUS_PX + 1):
+            top, left = NORMAL_RADIUS_PX + dy, NORMAL_RADIUS_PX + dx
             change = padded[top : top + height, left : left + width] - inverse
             same = np.abs(change) <= tolerance
             change *= same
@@ -408,7 +408,7 @@ def _fitted_slopes(sums: FloatMap) -> tuple[FloatArray, FloatArray, npt.NDArray[
     # Centred on the mean place of the pixels that count, which removes the constant.
     xx, xy, yy, xd, yd = xx - x * x / n, xy - x * y / n, yy - y * y / n, xd - x * d / n, yd - y * d / n
     determinant = xx * yy - xy * xy
-    determined = (n >= NORMAL_MIN_PIXELS) & (determinant > 1e-6 * (xx + yy) ** 2)
+    determined = (n >= MIN_NORMAL_PIXELS) & (determinant > 1e-6 * (xx + yy) ** 2)
     safe = np.where(determined, determinant, 1)
     slope_x = np.where(determined, (yy * xd - xy * yd) / safe, 0)
     slope_y = np.where(determined, (xx * yd - xy * xd) / safe, 0)
@@ -464,11 +464,11 @@ def _write_cameras_for_fusion(folder: Path) -> None:
 def _run_fusion(task: _FusionTask) -> int:
     """Points of the fused cloud."""
     options = pycolmap.StereoFusionOptions()
-    options.min_num_pixels = FUSED_VIEWS
+    options.min_num_pixels = MIN_FUSED_VIEWS
     options.max_reproj_error = FUSED_REPROJECTION_PX
-    options.max_depth_error = FUSED_DEPTH_ERROR
+    options.max_depth_error = FUSED_RELATIVE_DEPTH_ERROR
     options.max_normal_error = FUSED_NORMAL_ERROR_DEG
-    options.check_num_images = FUSED_CHECKED_IMAGES
+    options.check_num_images = MAX_FUSED_NEIGHBOURS
     options.num_threads = 1  # several start new points in the order of their luck, and the cloud differs every time
     options.use_cache = not task.fits_in_memory
     options.cache_size = task.memory_gib

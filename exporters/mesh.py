@@ -46,41 +46,41 @@ from smust3r_colmap.storage.atomic_write import write_atomically
 MIN_POINTS = 100
 """Fewer points of the cloud make no surface worth a file."""
 BULK_PERCENTILES = (1.0, 99.0)
-BULK_MARGIN = 0.5
+BULK_MARGIN_PER_EXTENT = 0.5
 """Points beyond the percentiles by more than this part of the extent are left out: one stray point far away would
 take the resolution from everything else, because both methods divide the whole extent."""
 CELL_PER_SPACING = 2.0
 """Edge of the smallest octree cell over the usual distance of neighbouring points."""
 OCTREE_DEPTHS = (6, 10)
 """Least and most; each step takes about four times the memory and time, 10 needs some GB."""
-COARSER_LEVELS = 1.5
+MAX_COARSER_LEVELS = 1.5
 """Octree levels below the median density from which on a vertex is cut away. On real clouds that leaves one vertex in
 a thousand farther than eight point spacings from any point, three levels leave fifteen."""
 VOXEL_PER_PIXEL = 1.5
 """Edge of a voxel over the width of a pixel at the median depth."""
 TRUNCATION_PER_DEPTH = 0.03
 """Distance from the surface, over the median depth, up to which a depth map speaks: more than depth maps disagree."""
-LARGEST_GRID = 1024
+MAX_GRID_VOXELS = 1024
 """Voxels along the longest side of the bulk at most."""
 BLOCK_VOXELS, FIRST_BLOCKS = 8, 10_000
 """Voxels per side of the blocks in which space near surfaces is kept, and blocks to start with (100 MB); it grows."""
 MIN_MAPS = 2
 """Depth maps that must have spoken about a voxel."""
-SMALLEST_PART = 1e-3
+MIN_COMPONENT_SHARE = 1e-3
 """Connected parts with fewer faces than this part of all are specks."""
 
 MAX_TEXTURE_PX = 8192
 """Side of the texture; the largest that graphics hardware has in common."""
 MAX_TEXTURE_VIEWS = 100
-MIN_VIEW_GAIN = 2e-3
+MIN_NEW_FACES_SHARE = 2e-3
 """Images are added to the texture while they show at least this part of the faces for the first time."""
-FACES_TO_CHOOSE_BY = 50_000
+MAX_FACES_TO_CHOOSE_BY = 50_000
 """Faces, evenly drawn, by which the images are chosen; all images times all faces would not fit in memory."""
-DEPTH_TOLERANCE = 0.03
+RELATIVE_DEPTH_TOLERANCE = 0.03
 """Relative difference between a face and the depth map up to which the image sees it, and nothing before it."""
-MIN_FACING = 0.15
+MIN_VIEW_COSINE = 0.15
 """Cosine between a face's normal and the direction to the camera; flatter views smear."""
-BETTER_VIEW = 1.5
+BETTER_VIEW_RATIO = 1.5
 """How many times more pixels a face must have in another image to be taken from that: fewer, larger patches."""
 _UNSEEN = -1
 _JPEG_QUALITY = 92
@@ -266,7 +266,7 @@ def _read_cloud(workspace: Path) -> tuple[FloatArray, FloatArray, UInt8Array]:
 def _bulk_box(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Lowest and highest corner (3,) of the box round most of the points (P, 3)."""
     low, high = np.percentile(points, BULK_PERCENTILES, axis=0)
-    margin = BULK_MARGIN * (high - low)
+    margin = BULK_MARGIN_PER_EXTENT * (high - low)
     return low - margin, high + margin
 
 
@@ -289,7 +289,7 @@ def _poisson(open3d: Any, workspace: Path) -> _Mesh:
     )
     # A density is the depth of the octree at which the samples lie: one less is twice as coarse.
     depths = np.asarray(densities)
-    mesh.remove_vertices_by_mask(depths < np.median(depths) - COARSER_LEVELS)
+    mesh.remove_vertices_by_mask(depths < np.median(depths) - MAX_COARSER_LEVELS)
     return _cleaned(open3d, mesh)
 
 
@@ -345,7 +345,7 @@ def _voxel_size(views: Sequence[_View], box: tuple[FloatArray, FloatArray]) -> t
             pixels.append(depths[-1] / view.img_from_cam[0, 0])
     if not depths:
         raise ReconstructionError("no depth map has a pixel")
-    finest = float((box[1] - box[0]).max()) / LARGEST_GRID
+    finest = float((box[1] - box[0]).max()) / MAX_GRID_VOXELS
     voxel = max(VOXEL_PER_PIXEL * float(np.median(pixels)), finest)
     return voxel, max(TRUNCATION_PER_DEPTH * float(np.median(depths)), 3 * voxel)
 
@@ -356,7 +356,7 @@ def _cleaned(open3d: Any, mesh: Any) -> _Mesh:
     part_of_face, faces_of_part, _ = mesh.cluster_connected_triangles()
     faces_of_part = np.asarray(faces_of_part)
     if len(faces_of_part):
-        specks = faces_of_part < SMALLEST_PART * faces_of_part.sum()
+        specks = faces_of_part < MIN_COMPONENT_SHARE * faces_of_part.sum()
         mesh.remove_triangles_by_mask(specks[np.asarray(part_of_face)])
         mesh.remove_unreferenced_vertices()
     return _Mesh(
@@ -369,13 +369,13 @@ def _cleaned(open3d: Any, mesh: Any) -> _Mesh:
 # ----------------------------------------------------------------------------- texture
 def _chosen_views(mesh: _Mesh, views: Sequence[_View]) -> list[_View]:
     """Images that together show most of the mesh, the one with most faces first; greedy set cover."""
-    faces = mesh.faces[:: max(1, len(mesh.faces) // FACES_TO_CHOOSE_BY)]
+    faces = mesh.faces[:: max(1, len(mesh.faces) // MAX_FACES_TO_CHOOSE_BY)]
     sees = np.array([_pixels_per_face(mesh, faces, view) > 0 for view in views])
     chosen: list[_View] = []
     while len(chosen) < MAX_TEXTURE_VIEWS:
         gains = sees.sum(axis=1)
         best = int(np.argmax(gains))
-        if gains[best] < max(MIN_VIEW_GAIN * len(faces), 1):
+        if gains[best] < max(MIN_NEW_FACES_SHARE * len(faces), 1):
             break
         chosen.append(views[best])
         sees &= ~sees[best]
@@ -388,7 +388,7 @@ def _best_views(mesh: _Mesh, views: Sequence[_View]) -> IntArray:
     pixels = np.zeros(len(mesh.faces))
     for position, view in enumerate(views):
         here = _pixels_per_face(mesh, mesh.faces, view)
-        better = here > BETTER_VIEW * pixels
+        better = here > BETTER_VIEW_RATIO * pixels
         view_of_face[better] = position
         pixels[better] = here[better]
     return view_of_face
@@ -412,10 +412,10 @@ def _pixels_per_face(mesh: _Mesh, faces: IntArray, view: _View) -> FloatArray:
     normals = np.cross(second - first, third - first)
     to_camera = view.centre() - centres
     lengths = np.linalg.norm(normals, axis=1) * np.linalg.norm(to_camera, axis=1)
-    facing = np.einsum("fi,fi->f", normals, to_camera) > MIN_FACING * lengths
+    facing = np.einsum("fi,fi->f", normals, to_camera) > MIN_VIEW_COSINE * lengths
     xy, z = view.project(centres)
     column, row = np.clip(xy.astype(np.intp), 0, (view.width - 1, view.height - 1)).T
-    visible = np.abs(view.depth()[row, column] - z) <= DEPTH_TOLERANCE * z
+    visible = np.abs(view.depth()[row, column] - z) <= RELATIVE_DEPTH_TOLERANCE * z
     (ux, uy), (vx, vy) = (b - a).T, (c - a).T
     pixels[rows] = np.where(facing & visible, np.abs(ux * vy - uy * vx) / 2, 0)
     return pixels

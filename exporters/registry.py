@@ -24,7 +24,7 @@ from smust3r_colmap.exporters.finished_run import FinishedRun, write_finished
 from smust3r_colmap.exporters.glb import write_glb
 from smust3r_colmap.exporters.mesh import MeshMethod, write_mesh
 from smust3r_colmap.exporters.ply import write_ply
-from smust3r_colmap.exporters.trainer_folder import write_trainer_folder
+from smust3r_colmap.exporters.training_dataset import write_training_dataset
 from smust3r_colmap.exporters.tum_trajectory import write_tum
 from smust3r_colmap.importers.masks import masks_of
 from smust3r_colmap.products import FusedScene, ImageCollection, Scene
@@ -202,7 +202,7 @@ def write_trajectory(finished: FinishedRun, settings: FormatSettings) -> Written
 # ----------------------------------------------------------------- folders for programs
 def write_trainer(finished: FinishedRun, settings: FormatSettings) -> Written:
     """``trainer``, of the largest model."""
-    report = write_trainer_folder(
+    report = write_training_dataset(
         _model_with_tracks(finished),
         finished.images,
         finished.output / TRAINER_FOLDER,

@@ -4,7 +4,7 @@ Camera axes are OpenGL's (x right, y up, z backward) and ``transform_matrix`` is
 turned as nerfstudio turns COLMAP's: (x, y, z) becomes (x, z, -y), because the first camera's y is down and z is up
 in nerfstudio. ``applied_transform`` says so in the file, and ``sparse_pc.ply`` is in the turned world too.
 instant-ngp works in a cube of side 1: ``scale`` and ``offset`` put the scene there, nerfstudio ignores them.
-The next module to read is ``trainer_folder``.
+The next module to read is ``training_dataset``.
 """
 
 from __future__ import annotations

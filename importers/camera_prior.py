@@ -26,7 +26,7 @@ DEFAULT_FOCAL_RATIO = 1.2
 PLAUSIBLE_FOCAL_RATIO = (0.1, 10.0)
 """Focal length by longer side beyond which a tag is taken for a mistake; COLMAP's own bounds."""
 
-_DIAGONAL_35MM = 43.27
+_FILM_DIAGONAL_MM = 43.27
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """EXIF FocalPlaneResolutionUnit: inch, centimetre, millimetre, micrometre."""
 
@@ -76,7 +76,7 @@ def focal_prior_px(tags: CameraTags, width: int, height: int) -> float | None:
     """
     longer = max(width, height)
     if tags.focal_35mm is not None:
-        focal = tags.focal_35mm / _DIAGONAL_35MM * math.hypot(width, height)
+        focal = tags.focal_35mm / _FILM_DIAGONAL_MM * math.hypot(width, height)
     elif tags.focal_mm is not None:
         sensor_mm = database_sensor_mm(tags.make, tags.model) or tags.sensor_mm
         if sensor_mm is None:

@@ -20,16 +20,16 @@ from scipy.spatial.transform import Rotation
 from smust3r_colmap.errors import InputError
 from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.geometry.camera import Intrinsics
-from smust3r_colmap.importers.colmap_records import CameraRecord, ImageRecord, PointRecords, Repairs, read_records
+from smust3r_colmap.importers.colmap_records import CameraRecord, Fixes, ImageRecord, PointRecords, read_records
 from smust3r_colmap.products import EMPTY_CLOUD, PointCloud, RejectedImage
 
 logger = logging.getLogger(__name__)
 
 
 MIN_IMAGES = 2
-ROUNDED_QUATERNION = 1e-4
+QUATERNION_ROUNDING = 1e-4
 """How far the length of a quaternion may be from 1 without a word: text with five digits."""
-USABLE_QUATERNION = 0.1
+MAX_QUATERNION_LENGTH_ERROR = 0.1
 """Beyond that it is no rotation written carelessly, but another number: a shifted column, an unscaled axis."""
 
 
@@ -64,7 +64,7 @@ class ExternalModel:
         cam_from_world: (N, 3, 4) rigid.
         surface: its points; images are positions in ``names``.
         unposed: images that are in the files but have no usable pose.
-        repairs: what was set right, one sentence each, with counts.
+        fixes: what was set right, one sentence each, with counts.
     """
 
     folder: Path
@@ -74,7 +74,7 @@ class ExternalModel:
     cam_from_world: FloatArray
     surface: SurfacePoints
     unposed: tuple[RejectedImage, ...]
-    repairs: tuple[str, ...]
+    fixes: tuple[str, ...]
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -97,8 +97,8 @@ def read_colmap_model(folder: Path) -> ExternalModel:
         InputError: no model, a broken file, a duplicate image id or name, an unknown camera, a rotation that is
             none, or fewer than two images with a pose; names file, line and number.
     """
-    repairs = Repairs()
-    records = read_records(folder, repairs)
+    fixes = Fixes()
+    records = read_records(folder, fixes)
     posed = [record for record in records.images if np.isfinite(record.numbers).all()]
     if len(posed) < MIN_IMAGES:
         raise InputError(
@@ -106,7 +106,7 @@ def read_colmap_model(folder: Path) -> ExternalModel:
         )
     _refuse_twins([(record.camera_id, record.place) for record in records.cameras], "camera id")
     _refuse_twins([(record.image_id, record.place) for record in records.images], "image id")
-    names = [_tidy_name(record, repairs) for record in posed]
+    names = [_tidy_name(record, fixes) for record in posed]
     _refuse_twins([(name, record.place) for name, record in zip(names, posed, strict=True)], "image name")
     cameras = {record.camera_id: record for record in records.cameras}
     first_image_of = {record.camera_id: record for record in reversed(posed)}
@@ -115,14 +115,14 @@ def read_colmap_model(folder: Path) -> ExternalModel:
         names=tuple(names),
         camera_ids=tuple(record.camera_id for record in posed),
         cameras={camera_id: _intrinsics(cameras, image) for camera_id, image in sorted(first_image_of.items())},
-        cam_from_world=np.stack([_cam_from_world(record, repairs) for record in posed]),
-        surface=_surface(records.points, [record.image_id for record in posed], records.folder, repairs),
+        cam_from_world=np.stack([_cam_from_world(record, fixes) for record in posed]),
+        surface=_surface(records.points, [record.image_id for record in posed], records.folder, fixes),
         unposed=tuple(
             RejectedImage(name=record.name, reason=f"its pose in the model is not finite ({record.place})")
             for record in records.images
             if record not in posed
         ),
-        repairs=repairs.texts(),
+        fixes=fixes.texts(),
     )
     logger.info("%s: %d images, %d points", model.folder, len(model), len(model.surface.cloud))
     return model
@@ -136,9 +136,9 @@ def _refuse_twins(keys: Sequence[tuple[Hashable, str]], what: str) -> None:
         place_of[key] = place
 
 
-def _tidy_name(record: ImageRecord, repairs: Repairs) -> str:
+def _tidy_name(record: ImageRecord, fixes: Fixes) -> str:
     """With forward slashes, as names are in COLMAP."""
-    repairs.note("image names with backslashes", record.place, count="\\" in record.name)
+    fixes.note("image names with backslashes", record.place, count="\\" in record.name)
     name = record.name.replace("\\", "/")
     if not name:
         raise InputError(f"{record.place}: image {record.image_id} has no name; write the name of its file")
@@ -167,30 +167,30 @@ def _intrinsics(cameras: Mapping[int, CameraRecord], image: ImageRecord) -> Intr
     return intrinsics
 
 
-def _cam_from_world(record: ImageRecord, repairs: Repairs) -> FloatArray:
+def _cam_from_world(record: ImageRecord, fixes: Fixes) -> FloatArray:
     """(3, 4), the rotation being that of the nearest unit quaternion."""
     quat_wxyz, translation = np.asarray(record.numbers[:4]), np.asarray(record.numbers[4:])
     length = float(np.linalg.norm(quat_wxyz))
-    if abs(length - 1) > USABLE_QUATERNION:
+    if abs(length - 1) > MAX_QUATERNION_LENGTH_ERROR:
         raise InputError(
             f"{record.place}: the quaternion of {record.name} has length {length:.4g}, needed is 1; are the columns "
             "QW QX QY QZ TX TY TZ?"
         )
-    repairs.note("quaternions were brought to length 1", record.place, count=abs(length - 1) > ROUNDED_QUATERNION)
+    fixes.note("quaternions were brought to length 1", record.place, count=abs(length - 1) > QUATERNION_ROUNDING)
     rotation = Rotation.from_quat(quat_wxyz[[1, 2, 3, 0]]).as_matrix()
     return np.column_stack([rotation, translation])
 
 
-def _surface(points: PointRecords | None, image_ids: Sequence[int], folder: Path, repairs: Repairs) -> SurfacePoints:
+def _surface(points: PointRecords | None, image_ids: Sequence[int], folder: Path, fixes: Fixes) -> SurfacePoints:
     """The finite points, and of their tracks what is evidence; images by their position in ``image_ids``."""
     if points is None:
-        repairs.note("files of points are missing", str(folder))
+        fixes.note("files of points are missing", str(folder))
         nothing = np.empty(0, np.int64)
         return SurfacePoints(cloud=EMPTY_CLOUD, point_of_observation=nothing, image_of_observation=nothing)
     finite: npt.NDArray[np.bool_] = np.asarray(np.isfinite(points.xyz).all(axis=1))
     colours = np.nan_to_num(points.rgb[finite]).clip(0, 255).astype(np.uint8)
-    repairs.note("points with a coordinate that is not finite were left out", str(folder), int((~finite).sum()))
-    point, image = _evidence(points, np.asarray(image_ids), finite, folder, repairs)
+    fixes.note("points with a coordinate that is not finite were left out", str(folder), int((~finite).sum()))
+    point, image = _evidence(points, np.asarray(image_ids), finite, folder, fixes)
     return SurfacePoints(
         cloud=PointCloud(xyz=points.xyz[finite], rgb=colours),
         point_of_observation=(np.cumsum(finite) - 1)[point],
@@ -199,19 +199,19 @@ def _surface(points: PointRecords | None, image_ids: Sequence[int], folder: Path
 
 
 def _evidence(
-    points: PointRecords, image_ids: IntArray, usable: npt.NDArray[np.bool_], folder: Path, repairs: Repairs
+    points: PointRecords, image_ids: IntArray, usable: npt.NDArray[np.bool_], folder: Path, fixes: Fixes
 ) -> tuple[IntArray, IntArray]:
     """Row of the point and position of the image, (M,) each, each pair once, of points in two images or more."""
     order = np.argsort(image_ids)
     place = np.minimum(np.searchsorted(image_ids, points.image_id_of_element, sorter=order), len(image_ids) - 1)
     image = order[place]
     known = image_ids[image] == points.image_id_of_element
-    repairs.note("track elements name an image that has no pose here", str(folder), int((~known).sum()))
+    fixes.note("track elements name an image that has no pose here", str(folder), int((~known).sum()))
     known &= usable[points.point_of_element]
     each_once = np.unique(points.point_of_element[known] * len(image_ids) + image[known])
     point, image = np.divmod(each_once, len(image_ids))
     num_views = np.bincount(point, minlength=len(points.xyz))
     alone = np.bincount(points.point_of_element, minlength=len(points.xyz)).astype(bool) & usable & (num_views < 2)
-    repairs.note("points have a track that is none (fewer than two images) and lost it", str(folder), int(alone.sum()))
+    fixes.note("points have a track that is none (fewer than two images) and lost it", str(folder), int(alone.sum()))
     seen_by_two = num_views[point] >= 2
     return point[seen_by_two], image[seen_by_two]

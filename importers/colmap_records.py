@@ -2,7 +2,7 @@
 
 Read here and not by pycolmap, because pycolmap refuses, without naming a line, much of what other programs
 write: points whose tracks name images that do not exist, ``images.txt`` without its empty lines, a folder
-without points. What can only mean one thing is read and noted as a repair; the rest is refused with file,
+without points. What can only mean one thing is read and noted as a fix; the rest is refused with file,
 line and number. Observations (``points2D``) and the files of rigs and frames are passed over: poses in
 ``images`` are complete without them, and whoever refines a model finds observations of his own.
 
@@ -88,7 +88,7 @@ class ModelRecords:
     points: PointRecords | None
 
 
-class Repairs:
+class Fixes:
     """Counts what was set right, and remembers where it happened first."""
 
     def __init__(self) -> None:
@@ -96,7 +96,7 @@ class Repairs:
         self._first: dict[str, str] = {}
 
     def note(self, what: str, place: str, count: int = 1) -> None:
-        """``what`` is in the plural, such as ``"images without a line of observations"``; a count of 0 is no repair."""
+        """``what`` is in the plural, such as ``"images without a line of observations"``; a count of 0 is no fix."""
         if count:
             self._counts[what] += count
             self._first.setdefault(what, place)
@@ -106,7 +106,7 @@ class Repairs:
         return tuple(f"{count} {what} (first: {self._first[what]})" for what, count in self._counts.items())
 
 
-def read_records(folder: Path, repairs: Repairs) -> ModelRecords:
+def read_records(folder: Path, fixes: Fixes) -> ModelRecords:
     """The records of the model in ``folder``, or in ``sparse/0``, ``sparse`` or ``0`` below it.
 
     Where a model lies there both ways the binary files are taken, as by COLMAP.
@@ -120,15 +120,15 @@ def read_records(folder: Path, repairs: Repairs) -> ModelRecords:
     if suffix == ".bin":
         return ModelRecords(
             folder=place,
-            cameras=tuple(_binary_cameras(_Cursor(cameras, repairs))),
-            images=tuple(_binary_images(_Cursor(images, repairs))),
-            points=_binary_points(_Cursor(points, repairs)) if points.exists() else None,
+            cameras=tuple(_binary_cameras(_Cursor(cameras, fixes))),
+            images=tuple(_binary_images(_Cursor(images, fixes))),
+            points=_binary_points(_Cursor(points, fixes)) if points.exists() else None,
         )
     return ModelRecords(
         folder=place,
         cameras=tuple(_text_cameras(cameras)),
-        images=tuple(_text_images(images, repairs)),
-        points=_text_points(points, repairs) if points.exists() else None,
+        images=tuple(_text_images(images, fixes)),
+        points=_text_points(points, fixes) if points.exists() else None,
     )
 
 
@@ -182,7 +182,7 @@ def _text_cameras(path: Path) -> Iterator[CameraRecord]:
         )
 
 
-def _text_images(path: Path, repairs: Repairs) -> Iterator[ImageRecord]:
+def _text_images(path: Path, fixes: Fixes) -> Iterator[ImageRecord]:
     """Every second line should have observations or be empty; as many writers forget that, each line is looked at."""
     missing = "images without a line of observations"
     awaited = ""  # the place of an image whose line of observations is still to come
@@ -190,10 +190,10 @@ def _text_images(path: Path, repairs: Repairs) -> Iterator[ImageRecord]:
         if not line or _are_observations(line):
             awaited = ""
             continue
-        repairs.note(missing, awaited, count=bool(awaited))
+        fixes.note(missing, awaited, count=bool(awaited))
         awaited = _line(path, number)
         yield _text_image(awaited, line)
-    repairs.note(missing, awaited, count=bool(awaited))
+    fixes.note(missing, awaited, count=bool(awaited))
 
 
 def _are_observations(line: bytes) -> bool:
@@ -221,7 +221,7 @@ def _text_image(place: str, line: bytes) -> ImageRecord:
     )
 
 
-def _text_points(path: Path, repairs: Repairs) -> PointRecords:
+def _text_points(path: Path, fixes: Fixes) -> PointRecords:
     """POINT3D_ID X Y Z R G B ERROR and pairs IMAGE_ID POINT2D_IDX; some writers have no ERROR where no track is."""
     numbers, lengths, images = array("d"), array("q"), array("q")
     for number, line in _lines(path):
@@ -238,7 +238,7 @@ def _text_points(path: Path, repairs: Repairs) -> PointRecords:
         except (ValueError, OverflowError) as error:
             raise InputError(f"{_line(path, number)}: {error}") from error
         if len(words) > 8 and len(words) % 2:
-            repairs.note("tracks that break off after an image id", _line(path, number))
+            fixes.note("tracks that break off after an image id", _line(path, number))
         lengths.append(len(track))
         images.extend(track)
     return _points(np.asarray(numbers).reshape(-1, 6), np.asarray(lengths), np.asarray(images))
@@ -277,13 +277,13 @@ def _decoded(word: bytes, place: str) -> str:
 class _Cursor:
     """Takes little-endian numbers from a file, and knows which record it is in when they end."""
 
-    def __init__(self, path: Path, repairs: Repairs) -> None:
+    def __init__(self, path: Path, fixes: Fixes) -> None:
         try:
             self._data = path.read_bytes()
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror})") from error
         self._path = path
-        self._repairs = repairs
+        self._fixes = fixes
         self._at = 0
         self._record = self._count = 0
 
@@ -299,7 +299,7 @@ class _Cursor:
             self._record = number
             yield
         left = len(self._data) - self._at
-        self._repairs.note("bytes after the last record were passed over", str(self._path), count=left)
+        self._fixes.note("bytes after the last record were passed over", str(self._path), count=left)
 
     def take(self, layout: struct.Struct) -> tuple[Any, ...]:
         """The next numbers."""

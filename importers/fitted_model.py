@@ -31,11 +31,11 @@ ASPECT_TOLERANCE = 0.05
 multiples of 14 or 16 px: at most 7 px of a side of 147 px, where 518 px are the longer one. 4:3 and 3:2 differ by
 an eighth."""
 
-SAME_FOCAL = 0.1
+SAME_FOCAL_TOLERANCE = 0.1
 """Relative distance from the median focal length within which cameras are one: a network's guesses for one lens
 scatter by a few percent, a zoom that was touched changes it by more."""
 
-ENOUGH_SEEN = 50
+MIN_SEEN_POINTS = 50
 """Points that say which surface an image sees; with fewer the whole cloud says it better."""
 
 _NAMES_SHOWN = 5
@@ -77,13 +77,13 @@ class FittedModel:
         return PointCloud(xyz=self.surface.cloud.xyz[untracked], rgb=self.surface.cloud.rgb[untracked])
 
     def seen_by_tracks(self) -> dict[int, npt.NDArray[np.float64]]:
-        """(S, 3) world points by image index, of the images in whose tracks ``ENOUGH_SEEN`` points stand."""
+        """(S, 3) world points by image index, of the images in whose tracks ``MIN_SEEN_POINTS`` points stand."""
         rows_of: dict[int, list[int]] = defaultdict(list)
         for image, row in zip(
             self.surface.image_of_observation.tolist(), self.surface.point_of_observation.tolist(), strict=True
         ):
             rows_of[image].append(row)
-        return {image: self.surface.cloud.xyz[rows] for image, rows in rows_of.items() if len(rows) >= ENOUGH_SEEN}
+        return {image: self.surface.cloud.xyz[rows] for image, rows in rows_of.items() if len(rows) >= MIN_SEEN_POINTS}
 
     def scene(self, origin: str) -> Scene:
         """As what a stitched run has before its refinement; ``origin`` says where it comes from.
@@ -118,7 +118,7 @@ def fit_to_images(
         model: as ``read_colmap_model`` gives it.
         scan: the image folder.
         share_cameras: cameras that have one image each become one, where the images lie in one folder, have one
-            size and one EXIF camera, and the focal lengths agree within ``SAME_FOCAL``.
+            size and one EXIF camera, and the focal lengths agree within ``SAME_FOCAL_TOLERANCE``.
         camera_model: COLMAP's name of the model that all cameras shall have; empty keeps what each has, but turns
             pinholes into SIMPLE_RADIAL, since most of them are guesses and photographs are distorted.
         calibrated: the cameras are known; they are brought to the size of the files and otherwise stay.
@@ -135,7 +135,7 @@ def fit_to_images(
         raise ConfigError(
             f"--camera-model {camera_model}: with --calibrated the cameras stay as they are; leave one out"
         )
-    notes = list(model.repairs)
+    notes = list(model.fixes)
     matched, unused, rejected = _match_files(model, scan, notes)
     order = sorted(matched, key=lambda position: natural_key(matched[position].name))
     files = [matched[position] for position in order]
@@ -353,7 +353,7 @@ def _shared_keys(
     shared = list(keys)
     for source, members in groups.items():
         middle = median(cameras[k].focal_px for k in members)
-        alike = [k for k in members if _relative_difference(cameras[k].focal_px, middle) <= SAME_FOCAL]
+        alike = [k for k in members if _relative_difference(cameras[k].focal_px, middle) <= SAME_FOCAL_TOLERANCE]
         if len(alike) < 2:
             continue
         for k in alike:

@@ -45,7 +45,7 @@ _PARTS = (
     ("exporter", "COLMAP model", "smust3r_colmap.exporters.colmap_sparse"),
     ("exporter", "COLMAP database", "smust3r_colmap.colmap.database"),
     ("exporter", "dense workspace", "smust3r_colmap.exporters.dense_workspace"),
-    ("exporter", "trainer folder", "smust3r_colmap.exporters.trainer_folder"),
+    ("exporter", "training dataset", "smust3r_colmap.exporters.training_dataset"),
     ("exporter", "PLY cloud", "smust3r_colmap.exporters.ply"),
     ("exporter", "GLB scene", "smust3r_colmap.exporters.glb"),
     ("exporter", "TUM trajectory", "smust3r_colmap.exporters.tum_trajectory"),

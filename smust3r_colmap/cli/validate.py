@@ -26,7 +26,7 @@ class Validate:
     """
 
     model: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MODEL")]
-    """Folder with the .bin or .txt files, or a scene, trainer folder or dense workspace that holds one."""
+    """Folder with the .bin or .txt files, or a scene, training dataset or dense workspace that holds one."""
     images: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Image files of the model; by default the folder images of its scene."""
     database: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None

@@ -4,7 +4,7 @@ Ids of cameras, rigs, frames and images are those of the model (index + 1), name
 the keypoints of an image are the points2D of the model, row by row: the mapper refuses anything else.
 Images without a pose are in it, too, so that a continuation may register them. Descriptors are left out: they
 are ten times as large as all the rest, and every pair worth matching has been matched.
-The next module to read is ``trainer_folder``.
+The next module to read is ``training_dataset``.
 """
 
 from __future__ import annotations

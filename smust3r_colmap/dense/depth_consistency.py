@@ -4,7 +4,7 @@ A backbone's maps cover the distorted originals and are in the unit of the stitc
 has moved that world a little, here more and there less. So every map is warped into the undistorted view,
 multiplied by the factor that puts it on the sparse points which its image observes, and compared with the
 maps of images that see the same points; depth that none of them confirms is dropped.
-The next modules to read are ``exporters.dense_workspace`` and ``exporters.trainer_folder``.
+The next modules to read are ``exporters.dense_workspace`` and ``exporters.training_dataset``.
 """
 
 from __future__ import annotations

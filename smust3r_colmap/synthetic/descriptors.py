@@ -23,7 +23,7 @@ from smust3r_colmap.synthetic.truth import TrueScene
 
 POINTS_PER_IMAGE = (6, 8)
 """Rows and columns of the points by which overlap is measured; 48 of them tell it to some percent."""
-SAME_SURFACE = 0.05
+SAME_SURFACE_RELATIVE_DEPTH = 0.05
 """Relative depth difference up to which a point is seen and not hidden."""
 ANGLE_SCALE_DEG = 30.0
 """Between two views of a point, at which it counts 1/e: descriptors stand turns of some ten degrees."""
@@ -95,7 +95,7 @@ def _seen_share(
     rows = in_front[inside]
     columns_img, rows_img = xy_img[inside].astype(int).T
     z, z_seen = points_cam[rows, 2], truth.depth(k)[rows_img, columns_img]
-    same = np.abs(z - z_seen) <= SAME_SURFACE * z
+    same = np.abs(z - z_seen) <= SAME_SURFACE_RELATIVE_DEPTH * z
     rows, z = rows[same], z[same]
 
     from_here = points_world.reshape(-1, 3)[rows] - truth.world_from_cam[k, :, 3]

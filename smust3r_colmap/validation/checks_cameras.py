@@ -7,22 +7,22 @@ from smust3r_colmap.validation.rules import Evidence, Rule, Severity, measured, 
 
 _UNDISTORT = (
     "undistort the images and the model (pycolmap.undistort_images, COLMAP's image_undistorter), "
-    "or use the trainer folder of a run"
+    "or use the training dataset of a run"
 )
 
 _OFF_CENTRE_PX = 1.0
 """Below, leaving the principal point out shifts a picture by less than its pixels."""
 
-_SCALED_LEAST = 0.15
-_SCALED_AGREE = 0.03
+_MIN_RESCALING = 0.15
+_RESCALING_TOLERANCE = 0.03
 """A principal point off by 15 % of the centre, and by the same factor in x and y, is one of another resolution:
 crops move it in one direction, and real lenses are off by a few percent."""
 
-_FOCAL_RANGE = (0.1, 10.0)
+_FOCAL_RATIO_RANGE = (0.1, 10.0)
 """Focal length over the longer side; the limits of COLMAP's mapper (min_focal_length_ratio and its counterpart)."""
 
-_ASPECT_RANGE = (0.9, 1.1)
-_LARGEST_DISTORTION = 1.0
+_FOCAL_ASPECT_RANGE = (0.9, 1.1)
+_MAX_DISTORTION = 1.0
 """Limit of COLMAP's mapper (max_extra_param)."""
 
 
@@ -141,7 +141,7 @@ def _size_zero(subject: Subject) -> Evidence | None:
     "principal-point-off-centre",
     "the principal point is not the centre of the image",
     severity=Severity.FACT,
-    advice="crop the images around it; the trainer folder of a run has it in the centre",
+    advice="crop the images around it; the training dataset of a run has it in the centre",
 )
 def _off_centre(subject: Subject) -> Evidence | None:
     found = []
@@ -179,7 +179,7 @@ def _scaled(camera: Camera) -> bool:
     if point is None or camera.width <= 0 or camera.height <= 0:
         return False
     x, y = 2 * point[0] / camera.width, 2 * point[1] / camera.height
-    return min(abs(x - 1), abs(y - 1)) > _SCALED_LEAST and abs(x - y) < _SCALED_AGREE * max(abs(x), abs(y))
+    return min(abs(x - 1), abs(y - 1)) > _MIN_RESCALING and abs(x - y) < _RESCALING_TOLERANCE * max(abs(x), abs(y))
 
 
 @rule(
@@ -192,7 +192,9 @@ def _focal_absurd(subject: Subject) -> Evidence | None:
     found = []
     for camera in subject.model.cameras:
         side = max(camera.width, camera.height)
-        if side > 0 and any(not _FOCAL_RANGE[0] <= focal / side <= _FOCAL_RANGE[1] for focal in camera.focal):
+        if side > 0 and any(
+            not _FOCAL_RATIO_RANGE[0] <= focal / side <= _FOCAL_RATIO_RANGE[1] for focal in camera.focal
+        ):
             found.append(f"camera {camera.camera_id}: {camera.focal[0]:g} px for {camera.width} x {camera.height}")
     return _cameras(subject, found)
 
@@ -208,7 +210,7 @@ def _focal_unequal(subject: Subject) -> Evidence | None:
     for camera in subject.model.cameras:
         if len(camera.focal) == 2 and camera.focal[1] != 0:
             ratio = camera.focal[0] / camera.focal[1]
-            if not _ASPECT_RANGE[0] <= ratio <= _ASPECT_RANGE[1]:
+            if not _FOCAL_ASPECT_RANGE[0] <= ratio <= _FOCAL_ASPECT_RANGE[1]:
                 found.append(f"camera {camera.camera_id}: fx / fy = {ratio:.2f}")
     return _cameras(subject, found)
 
@@ -223,7 +225,7 @@ def _distortion_absurd(subject: Subject) -> Evidence | None:
     found = []
     for camera in subject.model.cameras:
         largest = max(camera.distortion, key=abs, default=0.0)
-        if _known(camera) and CAMERA_MODELS[camera.model].fractional and abs(largest) > _LARGEST_DISTORTION:
+        if _known(camera) and CAMERA_MODELS[camera.model].fractional and abs(largest) > _MAX_DISTORTION:
             found.append(f"camera {camera.camera_id}: a parameter of {largest:.3g}")
     return _cameras(subject, found)
 

@@ -14,14 +14,14 @@ from smust3r_colmap.validation.rules import Evidence, Severity, measured, offend
 
 _PLY_COLUMNS = ("nx", "ny", "nz", "red", "green", "blue")
 _COMPARED_POINTS = 2000
-_SAME_PLACE = 1e-3
+_SAME_PLACE_RADII = 1e-3
 """Of the radius of the points; single precision and any rounding in text are far below."""
 
-_MOVED_SHARE = 0.01
-_SCALE_RANGE = (0.2, 5.0)
+_MAX_MOVED_SHARE = 0.01
+_DEPTH_SCALE_RATIO_RANGE = (0.2, 5.0)
 """Times the median scale, outside of which 3DGS leaves a depth map out."""
 
-_WRITE_TRAINER = "write the trainer folder again, which writes points3D.ply from the model"
+_WRITE_TRAINER = "write the training dataset again, which writes points3D.ply from the model"
 
 
 @rule(
@@ -62,7 +62,7 @@ def _ply_stale(subject: Subject) -> Evidence | None:
     if len(ply.xyz) != len(points):
         return measured(f"{len(ply.xyz):,} vertices for {len(points):,} points")
     moved = _share_moved(points.xyz, ply.xyz)
-    return measured(f"{moved:.0%} of its vertices are no point of the model") if moved > _MOVED_SHARE else None
+    return measured(f"{moved:.0%} of its vertices are no point of the model") if moved > _MAX_MOVED_SHARE else None
 
 
 def _share_moved(points: FloatArray, vertices: FloatArray) -> float:
@@ -74,7 +74,7 @@ def _share_moved(points: FloatArray, vertices: FloatArray) -> float:
     radius = float(np.quantile(np.linalg.norm(finite - np.median(finite, axis=0), axis=1), 0.9))
     sample = vertices[:: max(1, len(vertices) // _COMPARED_POINTS)]
     distance, _ = cKDTree(finite).query(sample)
-    return float((distance > _SAME_PLACE * max(radius, 1e-12)).mean())
+    return float((distance > _SAME_PLACE_RADII * max(radius, 1e-12)).mean())
 
 
 @rule(
@@ -131,7 +131,7 @@ def _depth_scale(subject: Subject) -> Evidence | None:
     scales = {stem: scale for stem, (scale, _) in subject.depth.params.items()}
     positive = [scale for scale in scales.values() if scale > 0]
     median = float(np.median(positive)) if positive else 1.0
-    low, high = _SCALE_RANGE[0] * median, _SCALE_RANGE[1] * median
+    low, high = _DEPTH_SCALE_RATIO_RANGE[0] * median, _DEPTH_SCALE_RATIO_RANGE[1] * median
     found = [f"{stem!r}: {scale:.3g}" for stem, scale in scales.items() if not low <= scale <= high]
     return offenders(found, of=len(scales), unit="maps")
 

@@ -13,7 +13,7 @@ from smust3r_colmap.validation.rules import (
     rule,
 )
 
-_SHOWN_MESSAGE = 200
+_MAX_MESSAGE_LETTERS = 200
 
 
 @rule(
@@ -188,7 +188,7 @@ def _without_number(subject: Subject) -> Evidence | None:
     advice="see the other findings; the message is that of COLMAP",
 )
 def _unread(subject: Subject) -> Evidence | None:
-    return measured(subject.unread_by_colmap[:_SHOWN_MESSAGE]) if subject.unread_by_colmap else None
+    return measured(subject.unread_by_colmap[:_MAX_MESSAGE_LETTERS]) if subject.unread_by_colmap else None
 
 
 RULES = (

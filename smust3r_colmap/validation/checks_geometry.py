@@ -11,15 +11,15 @@ from smust3r_colmap.validation.rules import Evidence, Severity, measured, offend
 _HIGH_ERROR_PX = 2.0
 """Mean reprojection error before any adjustment that a usable model stays below."""
 
-_FAR_CAMERA = 10.0
-_FAR_POINT = 50.0
+_FAR_CAMERA_RADII = 10.0
+_FAR_POINT_RADII = 50.0
 """Distances over the radius that half of all cameras lie in, or nine tenths of the points. Of nineteen models of
 photographs by COLMAP's two mappers the sound ones stay below 4 and 24; two have a camera at 400 and at 9,000."""
 
 _LARGE_COORDINATE = 1e5
 """Single precision then has steps of a centimetre, if the unit is a metre."""
 
-_UNIT_TOLERANCE = 1e-3
+_QUATERNION_LENGTH_TOLERANCE = 1e-3
 _POSE_TOLERANCE = 1e-6
 """Relative, between the pose of a frame and that of its image; both are written from one number."""
 
@@ -43,7 +43,7 @@ def _pose_not_finite(subject: Subject) -> Evidence | None:
 def _quaternion(subject: Subject) -> Evidence | None:
     images = subject.model.images
     length = np.linalg.norm(images.quat_wxyz, axis=1)
-    return _images(subject, images.finite & (np.abs(length - 1) > _UNIT_TOLERANCE))
+    return _images(subject, images.finite & (np.abs(length - 1) > _QUATERNION_LENGTH_TOLERANCE))
 
 
 @rule(
@@ -144,7 +144,7 @@ def _far_cameras(subject: Subject) -> Evidence | None:
         return None
     relative = _relative_distance(images.centre_world[usable], 0.5)
     far = np.zeros(len(images), np.bool_)
-    far[usable[relative > _FAR_CAMERA]] = True
+    far[usable[relative > _FAR_CAMERA_RADII]] = True
     return _images(subject, far)
 
 
@@ -152,7 +152,7 @@ def _far_cameras(subject: Subject) -> Evidence | None:
     "outlier-points",
     "points far away from all others",
     severity=Severity.WARNING,
-    advice="delete them, or write the trainer folder, which leaves them out",
+    advice="delete them, or write the training dataset, which leaves them out",
 )
 def _far_points(subject: Subject) -> Evidence | None:
     points = subject.model.points
@@ -160,7 +160,7 @@ def _far_points(subject: Subject) -> Evidence | None:
         return None
     far = np.zeros(len(points), np.bool_)
     usable = np.flatnonzero(np.isfinite(points.xyz).all(axis=1))
-    far[usable] = _relative_distance(points.xyz[usable], 0.9) > _FAR_POINT
+    far[usable] = _relative_distance(points.xyz[usable], 0.9) > _FAR_POINT_RADII
     return _points(subject, far)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from smust3r_colmap.validation.description import Camera, FileFolder, ImageFile, Subject
 from smust3r_colmap.validation.rules import Evidence, Severity, offenders, rule
 
-_SAME_SHAPE = 0.02
+_ASPECT_TOLERANCE = 0.02
 """Relative difference of the two ratios of sizes; a network's input is rounded to multiples of 14 or 16 pixels."""
 
 
@@ -86,7 +86,7 @@ def _sizes(subject: Subject, *, same_shape: bool) -> Evidence | None:
 def _has_shape(file: ImageFile, camera: Camera) -> bool:
     """Resizing could have made one of the other."""
     across, down = file.width * camera.height, camera.width * file.height
-    return abs(across - down) <= _SAME_SHAPE * max(across, down)
+    return abs(across - down) <= _ASPECT_TOLERANCE * max(across, down)
 
 
 @rule(

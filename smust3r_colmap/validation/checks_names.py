@@ -10,7 +10,7 @@ from pathlib import PurePosixPath, PureWindowsPath
 from smust3r_colmap.validation.description import Subject
 from smust3r_colmap.validation.rules import Evidence, Severity, measured, offenders, rule
 
-_FLATTEN = "rename the images, or let `smust3r-colmap export` write the trainer folder, which has flat names"
+_FLATTEN = "rename the images, or let `smust3r-colmap export` write the training dataset, which has flat names"
 
 
 def _names(subject: Subject, wrong: Callable[[str], bool]) -> Evidence | None:

@@ -11,10 +11,10 @@ from smust3r_colmap.validation.description import NO_POINT, Points, Subject
 from smust3r_colmap.validation.projection import index_of
 from smust3r_colmap.validation.rules import Evidence, Severity, measured, offenders, rule
 
-WEAK_OBSERVATIONS = 15
+MIN_OBSERVATIONS = 15
 """Fewer hold an image badly; COLMAP's mapper itself wants 30 inliers to place one."""
 
-_OUTSIDE_SHARE = 0.01
+_MAX_OUTSIDE_SHARE = 0.01
 """COLMAP's undistortion leaves observations a little outside, so a few are no error."""
 
 _REFINE = "`smust3r-colmap refine MODEL --images DIR` finds real tracks"
@@ -213,7 +213,7 @@ def _outside(subject: Subject) -> Evidence | None:
     limits = np.repeat(np.array(sizes, np.float64).reshape(-1, 2), images.num_rows, axis=0)
     used = images.point_ids != NO_POINT
     outside = np.flatnonzero(used & ((images.xy_img < 0) | (images.xy_img > limits)).any(axis=1))
-    if len(outside) <= _OUTSIDE_SHARE * max(1, int(used.sum())):
+    if len(outside) <= _MAX_OUTSIDE_SHARE * max(1, int(used.sum())):
         return None
     return _observations(subject, outside, [f"({x:.0f}, {y:.0f})" for x, y in images.xy_img[outside[:1]]])
 
@@ -236,12 +236,12 @@ def _unobserved(subject: Subject) -> Evidence | None:
 
 @rule(
     "image-weak",
-    f"images with fewer than {WEAK_OBSERVATIONS} observations",
+    f"images with fewer than {MIN_OBSERVATIONS} observations",
     severity=Severity.NOTE,
     advice="their poses hang by little; look at them, match them with more images or leave them out",
 )
 def _weak(subject: Subject) -> Evidence | None:
-    return _images_with(subject, lambda count: (count > 0) & (count < WEAK_OBSERVATIONS))
+    return _images_with(subject, lambda count: (count > 0) & (count < MIN_OBSERVATIONS))
 
 
 def _images_with(subject: Subject, wrong: Callable[[IntArray], BoolArray]) -> Evidence | None:

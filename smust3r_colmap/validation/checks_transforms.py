@@ -33,13 +33,13 @@ _KNOWN_MODELS = (
 """All that nerfstudio's table of camera models has; it takes a file that names none (the first) for a perspective
 camera."""
 
-_ROUNDED = 1e-3
+_ROUNDING_TOLERANCE = 1e-3
 """How far a rotation may be from orthonormal, and a camera from its place over the extent of all: rounded text."""
-_ROUNDED_DEG = 0.1
-_MIN_COMPARED = 3
+_ROUNDING_TOLERANCE_DEG = 0.1
+_MIN_COMPARED_CAMERAS = 3
 _OPENCV_AXES = np.diag([1.0, -1.0, -1.0])
 
-_WRITE_TRAINER = "write the trainer folder again"
+_WRITE_TRAINER = "write the training dataset again"
 _PATHS = "its paths are relative to its own folder, with the ending of the file"
 
 
@@ -216,7 +216,7 @@ def _not_rigid(matrix: FloatArray) -> str:
     rotation = matrix[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):  # of numbers without measure, which are off by NaN
         off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if not off <= _ROUNDED:
+    if not off <= _ROUNDING_TOLERANCE:
         return f"the rotation is {off:.2g} from orthonormal"
     return "the axes are left-handed" if np.linalg.det(rotation) < 0 else ""
 
@@ -251,7 +251,7 @@ def _cameras_differ(subject: Subject) -> Evidence | None:
     if compared is None:
         return None
     part = compared.position_max / max(compared.extent, np.finfo(float).tiny)
-    if part <= _ROUNDED and compared.rotation_max_deg <= _ROUNDED_DEG:
+    if part <= _ROUNDING_TOLERANCE and compared.rotation_max_deg <= _ROUNDING_TOLERANCE_DEG:
         return None
     return measured(
         f"up to {part:.2%} of the extent and {compared.rotation_max_deg:.2g} degrees, after the best similarity"
@@ -270,7 +270,7 @@ def _compared(transforms: TransformsFile, images: Images) -> Evaluation | None:
     }
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # as above
-            return compare_trajectories(of_file, of_model, min_compared=_MIN_COMPARED)
+            return compare_trajectories(of_file, of_model, min_compared=_MIN_COMPARED_CAMERAS)
     except DegenerateAlignmentError:  # two images, or a camera that only turned: no similarity
         return None
 

@@ -64,7 +64,7 @@ def find_layout(named: Path, *, images: Path | None, database: Path | None) -> L
     """Find a model at ``named`` or where programs look below it, and what belongs to it.
 
     Args:
-        named: folder of a model, of numbered models, of a scene, a trainer folder or a dense workspace.
+        named: folder of a model, of numbered models, of a scene, a training dataset or a dense workspace.
         images, database: where they are given they are taken; else they are looked for.
 
     Raises:

@@ -36,7 +36,7 @@ _POINT_ID_LIMIT = 2**64
 _EXACT_LIMIT = 2**53
 """Whole numbers below are exact as floats."""
 
-_SHOWN_LETTERS = 60
+_MAX_SHOWN_LETTERS = 60
 _NO_NUMBERS = np.empty(0)
 
 
@@ -352,5 +352,5 @@ def _numbers(line: str) -> FloatArray | None:
 
 
 def _bad_line(path: Path, number: int, line: str, why: str) -> Defect:
-    start = line.strip()[:_SHOWN_LETTERS]
+    start = line.strip()[:_MAX_SHOWN_LETTERS]
     return Defect(rule="text-bad-line", where=f"{path.name}, line {number}", text=f"{start!r} {why}")

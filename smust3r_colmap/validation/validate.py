@@ -71,7 +71,7 @@ def validate(
     """Check the COLMAP model at ``named``, or where programs look below it.
 
     Args:
-        named: folder of a model, of numbered models, of a scene, a trainer folder or a dense workspace.
+        named: folder of a model, of numbered models, of a scene, a training dataset or a dense workspace.
         images, database: taken instead of those that lie beside the model.
         readers: whose verdict counts.
         ask_colmap: also let pycolmap read the model, in a child process.

@@ -77,7 +77,7 @@ def test_text_glb_and_trajectory_are_added_on_demand(run: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_trainer_folder_is_made_with_masks_scales_and_notes(
+def test_a_training_dataset_is_made_with_masks_scales_and_notes(
     run: Path, finished_example: Example, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     move_a_point_far_away(run)

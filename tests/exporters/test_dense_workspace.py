@@ -161,8 +161,8 @@ def test_window_sums_are_those_of_every_window_by_itself() -> None:
     for (i, j), middle in np.ndenumerate(inverse):
         for (k, m), value in np.ndenumerate(inverse):
             dy, dx, change = k - i, m - j, float(value) - float(middle)
-            in_window = max(abs(dx), abs(dy)) <= dense_workspace.NORMAL_RADIUS
-            if middle > 0 and in_window and abs(change) <= dense_workspace.SAME_SURFACE * middle:
+            in_window = max(abs(dx), abs(dy)) <= dense_workspace.NORMAL_RADIUS_PX
+            if middle > 0 and in_window and abs(change) <= dense_workspace.SAME_SURFACE_RELATIVE_DEPTH * middle:
                 expected[:, i, j] += 1, dx, dy, dx * dx, dx * dy, dy * dy, change, dx * change, dy * change
     assert 5 < expected[0].mean() < 40
     np.testing.assert_allclose(found, expected, atol=1e-5)

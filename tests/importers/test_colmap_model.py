@@ -71,7 +71,7 @@ def test_what_colmap_writes_is_read_as_colmap_reads_it(kind: str, tmp_path: Path
     truth = synthetic()
     getattr(truth, f"write_{kind}")(tmp_path)
     model = read_colmap_model(tmp_path)
-    assert model.repairs == ()
+    assert model.fixes == ()
     assert sorted(model.names) == sorted(image.name for image in truth.images.values())
     for name, camera_id, cam_from_world in zip(model.names, model.camera_ids, model.cam_from_world, strict=True):
         image = truth.find_image_with_name(name)
@@ -105,15 +105,15 @@ def test_binary_files_are_taken_where_both_kinds_lie(tmp_path: Path) -> None:
 def test_a_model_without_points_is_read_and_says_so(tmp_path: Path) -> None:
     model = read(Text(points=None), tmp_path)
     assert len(model.surface.cloud) == 0
-    assert any("files of points are missing" in repair for repair in model.repairs)
+    assert any("files of points are missing" in fix for fix in model.fixes)
 
 
 def test_images_without_their_empty_lines_are_counted(tmp_path: Path) -> None:
     lines = [line for line in Text().images if "jpg" in line]
     model = read(Text(images=tuple(lines)), tmp_path)
     assert model.names == ("a.jpg", "b.jpg", "c.jpg")
-    assert model.repairs[0].startswith("3 images without a line of observations")
-    assert "images.txt: line 2" in model.repairs[0]
+    assert model.fixes[0].startswith("3 images without a line of observations")
+    assert "images.txt: line 2" in model.fixes[0]
 
 
 def test_pseudo_tracks_of_zeros_are_dropped_and_their_points_kept(tmp_path: Path) -> None:
@@ -122,8 +122,8 @@ def test_pseudo_tracks_of_zeros_are_dropped_and_their_points_kept(tmp_path: Path
     model = read(Text(points=points), tmp_path)
     assert len(model.surface.cloud) == 4
     assert len(model.surface.point_of_observation) == 0
-    assert any(repair.startswith("12 track elements name an image that has no pose") for repair in model.repairs)
-    assert any(repair.startswith("4 points have a track that is none") for repair in model.repairs)
+    assert any(fix.startswith("12 track elements name an image that has no pose") for fix in model.fixes)
+    assert any(fix.startswith("4 points have a track that is none") for fix in model.fixes)
 
 
 def test_the_zeros_are_no_track_of_image_zero_either(tmp_path: Path) -> None:
@@ -137,7 +137,7 @@ def test_tracks_of_one_image_are_no_evidence(tmp_path: Path) -> None:
     model = read(Text(points=("1 1 1 5 1 2 3 0.1 1 0", "2 1 1 6 1 2 3 0.1 1 1 3 1 1 2")), tmp_path)
     assert model.surface.point_of_observation.tolist() == [1, 1]
     assert model.surface.image_of_observation.tolist() == [0, 2]
-    assert any(repair.startswith("1 points have a track that is none") for repair in model.repairs)
+    assert any(fix.startswith("1 points have a track that is none") for fix in model.fixes)
 
 
 def test_points_that_are_not_finite_are_left_out_and_the_tracks_stay_right(tmp_path: Path) -> None:
@@ -146,13 +146,13 @@ def test_points_that_are_not_finite_are_left_out_and_the_tracks_stay_right(tmp_p
     assert model.surface.cloud.xyz.tolist() == [[1, 1, 6]]
     assert model.surface.point_of_observation.tolist() == [0, 0]
     assert model.surface.image_of_observation.tolist() == [1, 2]
-    assert any(repair.startswith("2 points with a coordinate that is not finite") for repair in model.repairs)
+    assert any(fix.startswith("2 points with a coordinate that is not finite") for fix in model.fixes)
 
 
 def test_a_track_that_breaks_off_keeps_its_whole_pairs(tmp_path: Path) -> None:
     model = read(Text(points=("1 1 1 6 1 2 3 0.1 1 0 2 0 3",)), tmp_path)
     assert model.surface.image_of_observation.tolist() == [0, 1]
-    assert any("1 tracks that break off" in repair and "line 2" in repair for repair in model.repairs)
+    assert any("1 tracks that break off" in fix and "line 2" in fix for fix in model.fixes)
 
 
 def test_points_without_an_error_column_are_read(tmp_path: Path) -> None:
@@ -173,7 +173,7 @@ def test_backslashes_in_names_become_slashes(tmp_path: Path) -> None:
     images = tuple(line.replace("a.jpg", "left\\a.jpg") for line in Text().images)
     model = read(Text(images=images), tmp_path)
     assert model.names[0] == "left/a.jpg"
-    assert any("1 image names with backslashes" in repair for repair in model.repairs)
+    assert any("1 image names with backslashes" in fix for fix in model.fixes)
 
 
 def test_windows_line_ends_and_a_byte_order_mark_are_passed_over(tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ def test_windows_line_ends_and_a_byte_order_mark_are_passed_over(tmp_path: Path)
         path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
     model = read_colmap_model(folder)
     assert model.names == ("a.jpg", "b.jpg", "c.jpg")
-    assert model.repairs == ()
+    assert model.fixes == ()
 
 
 def test_a_careless_quaternion_is_brought_to_length_one(tmp_path: Path) -> None:
@@ -190,7 +190,7 @@ def test_a_careless_quaternion_is_brought_to_length_one(tmp_path: Path) -> None:
     model = read(Text(images=images), tmp_path)
     rotations = model.cam_from_world[:, :, :3]
     np.testing.assert_allclose(rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (3, 1, 1)), atol=1e-12)
-    assert any(repair.startswith("3 quaternions were brought to length 1") for repair in model.repairs)
+    assert any(fix.startswith("3 quaternions were brought to length 1") for fix in model.fixes)
 
 
 def test_an_image_with_a_pose_of_nan_is_left_out_with_a_reason(tmp_path: Path) -> None:
@@ -294,7 +294,7 @@ def test_bytes_behind_a_binary_file_are_passed_over_and_told(tmp_path: Path) -> 
     synthetic().write_binary(tmp_path)
     with (tmp_path / "cameras.bin").open("ab") as file:
         file.write(b"12345")
-    assert any(repair.startswith("5 bytes after the last record") for repair in read_colmap_model(tmp_path).repairs)
+    assert any(fix.startswith("5 bytes after the last record") for fix in read_colmap_model(tmp_path).fixes)
 
 
 def test_an_unknown_binary_camera_model_is_refused_by_its_number(tmp_path: Path) -> None:
@@ -329,7 +329,7 @@ def external(
             cloud=EMPTY_CLOUD, point_of_observation=np.empty(0, np.int64), image_of_observation=np.empty(0, np.int64)
         ),
         unposed=(),
-        repairs=(),
+        fixes=(),
     )
 
 

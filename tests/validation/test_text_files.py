@@ -10,7 +10,7 @@ import pycolmap
 import pytest
 from helpers.described_models import edit_lines, found_in
 
-from smust3r_colmap.importers.colmap_records import Repairs, read_records
+from smust3r_colmap.importers.colmap_records import Fixes, read_records
 from smust3r_colmap.validation.description import Subject
 from smust3r_colmap.validation.layout import find_layout
 from smust3r_colmap.validation.projection import project
@@ -212,9 +212,9 @@ def test_refine_is_advised_for_lost_lines_of_observations_and_reads_them(
     edit_lines(tmp_path / "txt" / "images.txt", lambda lines: lines[::2])
     report = validate(tmp_path / "txt", ask_colmap=False)
     (line,) = [line for line in report.render_text().splitlines() if "[text-observations-missing]" in line]
-    repairs = Repairs()
+    fixes = Fixes()
 
     assert "Do: `smust3r-colmap refine MODEL --images DIR`" in line
     assert "Nobody can use it" not in line
-    assert len(read_records(tmp_path / "txt", repairs).images) == len(model.images)
-    assert "8 images without a line of observations" in repairs.texts()[0]
+    assert len(read_records(tmp_path / "txt", fixes).images) == len(model.images)
+    assert "8 images without a line of observations" in fixes.texts()[0]

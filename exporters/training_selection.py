@@ -5,7 +5,7 @@ cameras or points so far off that a reader which scales the scene to their exten
 What is far is measured by the model's own yardstick, the usual distance of a point from the nearest camera
 that sees it (the median). On nine image sets mapped by COLMAP the neighbouring cameras of sound models lay at most
 2 such distances apart and points at most 25 away; cameras gone astray were 9 to 7000 off.
-The next module to read is ``trainer_folder``.
+The next module to read is ``training_dataset``.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from smust3r_colmap.errors import InputError
 from smust3r_colmap.exporters.centred_pinhole import CentredPinhole
 from smust3r_colmap.geometry.arrays import BoolArray, FloatArray, IntArray
 
-FAR_CAMERA = 5.0
+FAR_CAMERA_DISTANCES = 5.0
 """Gap between a camera, or a group of them, and all others from which on it is left out, in usual distances. Cameras
 that see a common point are within the sum of their distances to it."""
-FAR_POINT = 30.0
+FAR_POINT_DISTANCES = 30.0
 """Distance of a point to the nearest camera that sees it from which on it is left out, in usual distances. COLMAP
 keeps points with 1.5 degrees of parallax: then the cameras are 30 / 38 of a usual distance apart."""
 
@@ -61,7 +61,7 @@ class LeftOut:
 
     Args:
         far_images, unobserved_images: names in the model.
-        far_points: points farther than ``FAR_POINT``, or with a coordinate that is not finite.
+        far_points: points farther than ``FAR_POINT_DISTANCES``, or with a coordinate that is not finite.
         points_of_few_views: points that fewer than two of the images that are left observe.
         observations_behind: of points that are not in front of the camera.
         observations_outside: beyond the border of the undistorted image.
@@ -122,9 +122,9 @@ def select_for_training(
     far_camera: BoolArray = np.zeros(len(centres), np.bool_)
     if not keep_outliers:
         usual = _usual_distance(centres, xyz, observations)
-        far_camera = _far_from_the_others(centres, FAR_CAMERA * usual)
+        far_camera = _far_from_the_others(centres, FAR_CAMERA_DISTANCES * usual)
         observations = observations.where(~far_camera[observations.image])
-        far_point |= nearest_camera_distance(centres, xyz, observations) > FAR_POINT * usual
+        far_point |= nearest_camera_distance(centres, xyz, observations) > FAR_POINT_DISTANCES * usual
         observations = observations.where(~far_point[observations.point])
     usable_point: BoolArray = _num_views(observations, len(xyz)) >= 2
     observations = observations.where(usable_point[observations.point])

@@ -1,4 +1,4 @@
-"""The pixels of a trainer folder: undistorted images and masks, and smaller copies of them.
+"""The pixels of a training dataset: undistorted images and masks, and smaller copies of them.
 
 A file that is as trainers want it already (a JPEG or PNG of a centred pinhole, 8-bit RGB, upright) is copied byte
 by byte; everything else is decoded, resampled once and encoded again. JPEG stays JPEG and all other formats become
@@ -47,7 +47,7 @@ _FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainerImage:
+class TrainingImage:
     """One image on its way into the folder.
 
     Args:
@@ -64,7 +64,7 @@ class TrainerImage:
 
 
 # ----------------------------------------------------------------------------- looking
-def look_at_image(images: Path, name: str, camera: CentredPinhole) -> TrainerImage:
+def look_at_image(images: Path, name: str, camera: CentredPinhole) -> TrainingImage:
     """Read the head of an image file and compare it with its camera.
 
     Raises:
@@ -93,7 +93,7 @@ def look_at_image(images: Path, name: str, camera: CentredPinhole) -> TrainerIma
             " give the images that the model was made of"
         )
     plain = kind == "JPEG" or (kind == "PNG" and bit_depth == 8)
-    return TrainerImage(
+    return TrainingImage(
         source=SourceImage(name=name, path=path, width=width, height=height, camera=0, digest=""),
         suffix=".jpg" if kind in ("JPEG", "MPO") else ".png",  # MPO: JPEG of phones with a second image behind
         camera=camera,
@@ -102,7 +102,7 @@ def look_at_image(images: Path, name: str, camera: CentredPinhole) -> TrainerIma
 
 
 # ----------------------------------------------------------------------------- writing
-def write_images(images: Sequence[tuple[TrainerImage, str]], folder: Path, scales: Sequence[int]) -> None:
+def write_images(images: Sequence[tuple[TrainingImage, str]], folder: Path, scales: Sequence[int]) -> None:
     """Write ``images/<new name>`` and, for each scale, ``images_<scale>/<new name>`` below ``folder``.
 
     Smaller copies are means over areas; width and height are divided and rounded down, as nerfstudio expects.
@@ -121,7 +121,7 @@ def write_images(images: Sequence[tuple[TrainerImage, str]], folder: Path, scale
 
 
 def write_masks(
-    images: Sequence[tuple[TrainerImage, str]], masks: Path, folder: Path, scales: Sequence[int]
+    images: Sequence[tuple[TrainingImage, str]], masks: Path, folder: Path, scales: Sequence[int]
 ) -> tuple[str, ...]:
     """Write the masks below ``folder`` in both naming rules, for nerfstudio and Brush, and for COLMAP.
 
@@ -152,7 +152,7 @@ def _make_folders(folder: Path, kind: str, scales: Sequence[int]) -> None:
 
 
 def _each_camera_at_once(
-    images: Sequence[tuple[TrainerImage, str]], write: Callable[[TrainerImage, str, _Lookup], None]
+    images: Sequence[tuple[TrainingImage, str]], write: Callable[[TrainingImage, str, _Lookup], None]
 ) -> None:
     """Call ``write`` on every image from several threads; images of one camera share its lookup."""
     chunks = []
@@ -161,7 +161,7 @@ def _each_camera_at_once(
         of_camera = list(group)
         chunks += [of_camera[k : k + IMAGES_PER_LOOKUP] for k in range(0, len(of_camera), IMAGES_PER_LOOKUP)]
 
-    def work(chunk: list[tuple[TrainerImage, str]]) -> None:
+    def work(chunk: list[tuple[TrainingImage, str]]) -> None:
         camera = chunk[0][0].camera
         lookup = None if camera.is_identity else camera.lookup()
         for image, name in chunk:
@@ -172,7 +172,7 @@ def _each_camera_at_once(
             pass
 
 
-def _write_image(folder: Path, scales: Sequence[int], image: TrainerImage, name: str, lookup: _Lookup) -> None:
+def _write_image(folder: Path, scales: Sequence[int], image: TrainingImage, name: str, lookup: _Lookup) -> None:
     if image.verbatim:
         shutil.copyfile(image.source.path, folder / "images" / name)
     if not image.verbatim or scales:
@@ -189,7 +189,7 @@ def _write_mask(
     masks: Path,
     folder: Path,
     scales: Sequence[int],
-    image: TrainerImage,
+    image: TrainingImage,
     name: str,
     lookup: _Lookup,
 ) -> None:
@@ -205,7 +205,7 @@ def _write_mask(
             (folder / below / mask_name).write_bytes(content)
 
 
-def _kept(masks: Path, image: TrainerImage) -> UInt8Array:
+def _kept(masks: Path, image: TrainingImage) -> UInt8Array:
     """(H, W) of the original image, 255 where it is kept."""
     path = find_mask(masks, image.source.name)
     if path is None:
@@ -218,7 +218,7 @@ def _smaller(pixels: UInt8Array, scale: int, how: int) -> UInt8Array:
     return np.asarray(cv2.resize(pixels, (width // scale, height // scale), interpolation=how), np.uint8)
 
 
-def check_scales(scales: Sequence[int], images: Sequence[TrainerImage]) -> None:
+def check_scales(scales: Sequence[int], images: Sequence[TrainingImage]) -> None:
     """Refuse scales that are no whole numbers from 2 on, repeat, or leave nothing of the smallest image.
 
     Raises:

@@ -34,15 +34,15 @@ from smust3r_colmap.exporters.centred_pinhole import CentredPinhole
 from smust3r_colmap.exporters.flat_names import flat_names
 from smust3r_colmap.exporters.inverse_depth import common_scale, inverse_depth_values
 from smust3r_colmap.exporters.ply import write_ply
-from smust3r_colmap.exporters.trainer_images import (
-    TrainerImage,
+from smust3r_colmap.exporters.training_images import (
+    TrainingImage,
     check_scales,
     encoded,
     look_at_image,
     write_images,
     write_masks,
 )
-from smust3r_colmap.exporters.trainer_selection import LeftOut, Selection, nearest_camera_distance, select_for_training
+from smust3r_colmap.exporters.training_selection import LeftOut, Selection, nearest_camera_distance, select_for_training
 from smust3r_colmap.exporters.transforms_json import points_saved, transforms_json
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.products import DepthMaps, PointCloud
@@ -51,10 +51,10 @@ from smust3r_colmap.storage.atomic_write import atomic_folder
 logger = logging.getLogger(__name__)
 
 
-LONGEST_DEPTH_PX = 640
+MAX_DEPTH_SIDE_PX = 640
 """Longer side of the largest depth maps. Backbones give 256 to 512 pixels, so larger files hold nothing more, and
 3DGS resizes them to its images anyway; at 640 a map takes 0.3 MB instead of 5 and a tenth of the time."""
-NORMAL_REACH = 0.02
+NORMAL_REACH_PER_DISTANCE = 0.02
 """How near, over its distance from the camera, a point of the cloud must be to lend its normal."""
 
 _OURS = re.compile(
@@ -62,11 +62,11 @@ _OURS = re.compile(
     r"|(images|masks)_[1-9][0-9]*"
     r"|images_[1-9][0-9]*_png"  # gsplat's own copies of JPEG
 )
-"""What a trainer folder holds, of whatever scales."""
+"""What a training dataset holds, of whatever scales."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainerReport:
+class TrainingReport:
     """What was written, and what was left out and why.
 
     Args:
@@ -90,7 +90,7 @@ class TrainerReport:
     images_without_mask: tuple[str, ...]
 
 
-def write_trainer_folder(
+def write_training_dataset(
     model: pycolmap.Reconstruction,
     images: Path,
     folder: Path,
@@ -100,7 +100,7 @@ def write_trainer_folder(
     scales: tuple[int, ...] = (),
     masks: Path | None = None,
     keep_outliers: bool = False,
-) -> TrainerReport:
+) -> TrainingReport:
     """Write ``folder``, or replace what an earlier call has written there.
 
     Args:
@@ -145,7 +145,7 @@ def write_trainer_folder(
         write_ply(points_saved(points), partial / "sparse_pc.ply")
         _write_json(names, partial / "names.json")
 
-    report = TrainerReport(
+    report = TrainingReport(
         num_images=len(sources),
         num_cameras=pinholes.num_cameras(),
         num_points=len(points),
@@ -172,9 +172,9 @@ def _used_cameras(model: pycolmap.Reconstruction) -> list[int]:
 
 def _look_at_images(
     model: pycolmap.Reconstruction, images: Path, selection: Selection, cameras: Mapping[int, CentredPinhole]
-) -> dict[int, TrainerImage]:
+) -> dict[int, TrainingImage]:
     """By image id, the files of the selected images, all looked at before anything is written."""
-    sources: dict[int, TrainerImage] = {}
+    sources: dict[int, TrainingImage] = {}
     id_of: dict[str, int] = {}
     for i in selection.image_ids:
         name = model.image(i).name
@@ -231,7 +231,7 @@ def _points(pinholes: pycolmap.Reconstruction, selection: Selection, cloud: Poin
         gap, row = cKDTree(cloud.xyz, balanced_tree=False, compact_nodes=False).query(selection.xyz)
         lent = cloud.normals[row].astype(np.float64)
         lent[np.einsum("pi,pi->p", lent, normals) < 0] *= -1
-        normals = np.where((gap <= NORMAL_REACH * nearest)[:, None], lent, normals)
+        normals = np.where((gap <= NORMAL_REACH_PER_DISTANCE * nearest)[:, None], lent, normals)
     return PointCloud(xyz=selection.xyz, rgb=selection.rgb, normals=normals.astype(np.float32))
 
 
@@ -267,10 +267,10 @@ def _write_depths(
 
 
 def _with_small_cameras(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """The same images, without points, for depth maps of at most ``LONGEST_DEPTH_PX``."""
+    """The same images, without points, for depth maps of at most ``MAX_DEPTH_SIDE_PX``."""
     small = pycolmap.Reconstruction()
     for camera in model.cameras.values():
-        shrink = min(1.0, LONGEST_DEPTH_PX / max(camera.width, camera.height))
+        shrink = min(1.0, MAX_DEPTH_SIDE_PX / max(camera.width, camera.height))
         resized = pycolmap.Camera(camera.todict())
         resized.rescale(max(1, round(shrink * camera.width)), max(1, round(shrink * camera.height)))
         small.add_camera_with_trivial_rig(resized)

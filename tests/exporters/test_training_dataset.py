@@ -1,4 +1,4 @@
-"""The trainer folder by the rules of its readers, read with struct, json and OpenCV, not with what wrote it."""
+"""The training dataset by the rules of its readers, read with struct, json and OpenCV, not with what wrote it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from smust3r_colmap.errors import ImageError, InputError, RunDirectoryError, Sto
 from smust3r_colmap.exporters.centred_pinhole import CentredPinhole
 from smust3r_colmap.exporters.flat_names import flat_names
 from smust3r_colmap.exporters.inverse_depth import common_scale, inverse_depth_values
-from smust3r_colmap.exporters.trainer_folder import TrainerReport, write_trainer_folder
+from smust3r_colmap.exporters.training_dataset import TrainingReport, write_training_dataset
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.products import PointCloud
 
@@ -95,7 +95,7 @@ def write_ramps(folder: Path, names: Sequence[str] = NAMES) -> Path:
 @dataclass(frozen=True)
 class Written:
     folder: Path
-    report: TrainerReport
+    report: TrainingReport
     sparse: ReadModel
     names: dict[str, str]
 
@@ -118,7 +118,7 @@ def write(
     """Write the folder beside images that are made where they are missing."""
     images, folder = tmp_path / "in", tmp_path / "out" / "trainer"
     write_ramps(images, [i.name for i in model.images.values() if not (images / i.name).exists()])
-    report = write_trainer_folder(
+    report = write_training_dataset(
         model, images, folder, maps=maps, cloud=cloud, scales=scales, masks=masks, keep_outliers=keep_outliers
     )
     names = json.loads((folder / "names.json").read_text(encoding="utf-8"))
@@ -470,18 +470,18 @@ def test_missing_and_misfit_images_are_refused_before_anything_is_written(tmp_pa
     (images / "4.png").unlink()
     arguments = (plane_model(), images, tmp_path / "out/trainer")
     with pytest.raises(ImageError, match=r"^4\.png: there is no such file in .*in; give the folder"):
-        write_trainer_folder(*arguments, maps=None, cloud=None)
+        write_training_dataset(*arguments, maps=None, cloud=None)
     Image.fromarray(ramp(80, 60)).save(images / "4.png")
     with pytest.raises(ImageError, match=r"^4\.png: the file is 80x60 px and its camera 160x120"):
-        write_trainer_folder(*arguments, maps=None, cloud=None)
+        write_training_dataset(*arguments, maps=None, cloud=None)
     exif = Image.Exif()
     exif[0x0112] = 6
     Image.fromarray(ramp()).save(images / "4.png", exif=exif)
     with pytest.raises(ImageError, match=r"is 120x160 px \(stored as 160x120, turned by its EXIF orientation\)"):
-        write_trainer_folder(*arguments, maps=None, cloud=None)
+        write_training_dataset(*arguments, maps=None, cloud=None)
     (images / "4.png").write_text("no image")
     with pytest.raises(ImageError, match=r"^4\.png: cannot be read as JPEG, PNG, WebP or TIFF"):
-        write_trainer_folder(*arguments, maps=None, cloud=None)
+        write_training_dataset(*arguments, maps=None, cloud=None)
     assert not (tmp_path / "out").exists()
 
 
