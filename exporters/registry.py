@@ -14,7 +14,7 @@ from pathlib import Path
 import pycolmap
 
 from smust3r_colmap.colmap.model_files import MODEL_FILES, refuse_names_text_cannot_hold, write_text_checked
-from smust3r_colmap.config import OutputConfig, RunConfig
+from smust3r_colmap.config import ModelOutputConfig, OutputConfig, RefineConfig, RunConfig
 from smust3r_colmap.errors import InputError, MissingDependencyError, ReconstructionError
 from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.execution.stage_clock import StageClock
@@ -55,12 +55,12 @@ class FormatSettings:
     mesh: MeshMethod = "poisson"
 
     @classmethod
-    def of(cls, config: OutputConfig) -> FormatSettings:
+    def of(cls, config: ModelOutputConfig) -> FormatSettings:
         """What the settings of a run say."""
         return cls(
             text=config.text,
-            trainer_scales=config.trainer_factors,
-            mesh="poisson" if config.mesh == "none" else config.mesh,
+            trainer_scales=config.trainer_scales or (),
+            mesh=config.mesh if isinstance(config, OutputConfig) and config.mesh != "none" else "poisson",
         )
 
 
@@ -90,7 +90,7 @@ def export(
     initial: InitialScenes,
     images: Path,
     collection: ImageCollection,
-    config: RunConfig,
+    config: RunConfig | RefineConfig,
     *,
     before: Mapping[str, Scene],
 ) -> Outputs:
@@ -115,7 +115,7 @@ def export(
         models=(None,) * len(fused) if refinement is None else refinement.models,
         database=refinement.database if refinement is not None and has_tracks else None,
         maps=initial.maps,
-        masks=masks_of(collection, config.importing.masks),
+        masks=masks_of(collection, config.masks),
     )
     settings = FormatSettings.of(config.output)
     with run.clock.stage("export", total=1) as progress:

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from smust3r_colmap.config import ImportConfig
+from smust3r_colmap.config import CameraConfig
 from smust3r_colmap.errors import ConfigError, InputError
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.colmap_model import MIN_IMAGES, ExternalModel, SurfacePoints
@@ -108,9 +108,9 @@ def fit_to_images(
     scan: FolderScan,
     *,
     share_cameras: bool = True,
-    camera_model: str = "",
+    camera_model: str | None = None,
     calibrated: bool = False,
-    complete: bool = False,
+    register_missing: bool = False,
 ) -> FittedModel:
     """Find the file of every image, and the camera of every file.
 
@@ -119,12 +119,12 @@ def fit_to_images(
         scan: the image folder.
         share_cameras: cameras that have one image each become one, where the images lie in one folder, have one
             size and one EXIF camera, and the focal lengths agree within ``SAME_FOCAL_TOLERANCE``.
-        camera_model: COLMAP's name of the model that all cameras shall have; empty keeps what each has, but turns
+        camera_model: COLMAP's name of the model that all cameras shall have; None keeps what each has, but turns
             pinholes into SIMPLE_RADIAL, since most of them are guesses and photographs are distorted.
         calibrated: the cameras are known; they are brought to the size of the files and otherwise stay.
-        complete: files that the model has no image of join the collection, without a pose. Each has the camera of
-            files like it; where there are none, a camera of its own that starts from EXIF or COLMAP's guess, in the
-            model that a run of ours takes, unless the cameras are known: then it is left out.
+        register_missing: files that the model has no image of join the collection, without a pose. Each has the
+            camera of files like it; where there are none, a camera of its own that starts from EXIF or COLMAP's guess,
+            in the model that a run of ours takes, unless the cameras are known: then it is left out.
 
     Raises:
         InputError: a name fits several files, two images fit one file, fewer than two images have a file, or the
@@ -152,15 +152,15 @@ def fit_to_images(
     if not calibrated:
         cameras = _remodelled(cameras, camera_model, notes)
     others = [*model.unposed, *rejected]
-    if complete:
+    if register_missing:
         owned = list(zip(files, camera_of, strict=True))
-        guessed_model = camera_model or ImportConfig.camera_model
+        guessed_model = camera_model or CameraConfig.camera_model
         cameras, owned_by_others, without_camera = _cameras_of_others(
             unused, owned, cameras, guessed_model, calibrated, notes
         )
         files, camera_of = [*files, *owned_by_others], (*camera_of, *owned_by_others.values())
         others = [*_of_no_file(model.unposed, unused), *rejected, *without_camera]
-    _remark_on_unused([] if complete else unused, notes)
+    _remark_on_unused([] if register_missing else unused, notes)
     images = tuple(
         SourceImage(
             name=file.name,
@@ -266,7 +266,9 @@ def _of_no_file(images: Iterable[RejectedImage], files: Iterable[_File]) -> list
 def _remark_on_unused(unused: Sequence[_File], notes: list[str]) -> None:
     if unused:
         names = _few(file.name for file in unused)
-        notes.append(f"{len(unused)} files of the folder are not in the model and stay out (--complete): {names}")
+        notes.append(
+            f"{len(unused)} files of the folder are not in the model; --register-missing would try them: {names}"
+        )
 
 
 def _found_names(model: ExternalModel, file_names: Sequence[str], scan: FolderScan, notes: list[str]) -> dict[int, str]:
@@ -419,9 +421,9 @@ _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
 """Models that mean the same by a parameter of the same name."""
 
 
-def _remodelled(cameras: Sequence[Intrinsics], wanted: str, notes: list[str]) -> tuple[Intrinsics, ...]:
-    """All cameras in the model ``wanted``, or, where it is empty, pinholes of square pixels as SIMPLE_RADIAL."""
-    if wanted:
+def _remodelled(cameras: Sequence[Intrinsics], wanted: str | None, notes: list[str]) -> tuple[Intrinsics, ...]:
+    """All cameras in the model ``wanted``, or, where it is None, pinholes of square pixels as SIMPLE_RADIAL."""
+    if wanted is not None:
         return tuple(_converted(camera, wanted) for camera in cameras)
     changed = tuple(_converted(camera, "SIMPLE_RADIAL") if _may_be_radial(camera) else camera for camera in cameras)
     count = sum(new != old for new, old in zip(changed, cameras, strict=True))

@@ -22,7 +22,7 @@ from statistics import median
 
 import pycolmap
 
-from smust3r_colmap.config import CameraMode, ImportConfig
+from smust3r_colmap.config import CameraConfig, CameraMode
 from smust3r_colmap.errors import CollectionError, ConfigError, ImageError
 from smust3r_colmap.execution.task_pool import usable_cores
 from smust3r_colmap.geometry.camera import Intrinsics
@@ -83,7 +83,7 @@ class FolderScan:
 
 
 def import_image_folder(
-    folder: Path, config: ImportConfig, *, known: Mapping[str, ImportRecord] | None = None, workers: int = 0
+    folder: Path, config: CameraConfig, *, known: Mapping[str, ImportRecord] | None = None, workers: int | None = None
 ) -> ImageCollection:
     """Scan a folder and make a collection of it.
 
@@ -91,7 +91,7 @@ def import_image_folder(
         folder: holds the images, directly or in subfolders.
         config: which images share a camera, and its model.
         known: records of an earlier scan by name; files that did not change are not read again.
-        workers: threads; 0 takes one per core that this process may use.
+        workers: threads; None takes one per core that this process may use.
 
     Raises:
         ConfigError: the camera model does not exist, or the camera mode does not fit the image sizes.
@@ -123,16 +123,16 @@ def check_output_not_inside(images: Path, output: Path) -> None:
         raise ConfigError(f"the output folder {output} lies inside the image folder {images}; choose one beside it")
 
 
-def check_masks_not_inside(images: Path, masks: str) -> None:
+def check_masks_not_inside(images: Path, masks: Path | None) -> None:
     """Refuse masks among the images: they would be read as photographs, or photographs as masks.
 
     Args:
-        masks: the folder, as the setting names it; empty for none.
+        masks: the folder, or None.
 
     Raises:
         ConfigError: the folder of masks is the image folder or lies in it.
     """
-    if masks and _lies_in(images, Path(masks)):
+    if masks is not None and _lies_in(images, masks):
         raise ConfigError(
             f"--masks {masks}: lies inside the image folder {images}, where masks and photographs are taken for each "
             "other; move the masks beside it"
@@ -144,7 +144,9 @@ def _lies_in(outer: Path, inner: Path) -> bool:
 
 
 # --------------------------------------------------------------------------------- scan
-def scan_image_folder(folder: Path, *, known: Mapping[str, ImportRecord] | None = None, workers: int = 0) -> FolderScan:
+def scan_image_folder(
+    folder: Path, *, known: Mapping[str, ImportRecord] | None = None, workers: int | None = None
+) -> FolderScan:
     """Read and decode every image file once; arguments as ``import_image_folder``.
 
     Raises:
@@ -152,7 +154,7 @@ def scan_image_folder(folder: Path, *, known: Mapping[str, ImportRecord] | None 
     """
     listing = _list_folder(folder)
     look = partial(_record, folder, known or {})
-    with ThreadPoolExecutor(workers or min(usable_cores(), MAX_THREADS)) as pool:
+    with ThreadPoolExecutor(min(workers or usable_cores(), MAX_THREADS)) as pool:
         results = list(pool.map(look, listing.names))
     unreadable = [*listing.unreadable, *(result for result in results if isinstance(result, RejectedImage))]
     return FolderScan(
@@ -298,7 +300,7 @@ class _Usable:
         return f"{self.photo.width}x{self.photo.height}"
 
 
-def collection_from_scan(scan: FolderScan, config: ImportConfig) -> ImageCollection:
+def collection_from_scan(scan: FolderScan, config: CameraConfig) -> ImageCollection:
     """Leave out what cannot be used and share cameras.
 
     Of names that differ only in the way accents are composed, the first is kept. Files with the same content
@@ -313,8 +315,8 @@ def collection_from_scan(scan: FolderScan, config: ImportConfig) -> ImageCollect
     _check_enough(scan, usable, rejected)
     groups = _camera_groups(usable, config.camera_mode)
     cameras = [shared_prior([usable[index].photo for index in members], config.camera_model) for members in groups]
-    if config.camera_params:
-        cameras = _known_cameras(cameras, config)
+    if config.camera_params is not None:
+        cameras = _known_cameras(cameras, config.camera_params, config.camera_model)
     camera_of = {index: camera for camera, members in enumerate(groups) for index in members}
     images = tuple(
         SourceImage(
@@ -329,7 +331,7 @@ def collection_from_scan(scan: FolderScan, config: ImportConfig) -> ImageCollect
     )
     logger.info("%s: %d images, %d cameras, %d left out", scan.folder, len(images), len(cameras), len(rejected))
     return ImageCollection(
-        images=images, cameras=tuple(cameras), rejected=tuple(rejected), calibrated=bool(config.camera_params)
+        images=images, cameras=tuple(cameras), rejected=tuple(rejected), calibrated=config.camera_params is not None
     )
 
 
@@ -422,19 +424,19 @@ def shared_prior(photos: Sequence[Photo], camera_model: str) -> Intrinsics:
     return Intrinsics.from_colmap(camera)
 
 
-def _known_cameras(cameras: Sequence[Intrinsics], config: ImportConfig) -> list[Intrinsics]:
+def _known_cameras(cameras: Sequence[Intrinsics], given_params: str, model: str) -> list[Intrinsics]:
     """The calibration that was given, for every camera.
 
     Raises:
         ConfigError: it is no list of numbers, has the wrong count, or the images have more than one size.
     """
-    given, model = f"--camera-params {config.camera_params}", config.camera_model
+    given = f"--camera-params {given_params}"
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     if len(sizes) > 1:
         shown = ", ".join(f"{width}x{height}" for width, height in sizes[:4])
         raise ConfigError(f"{given}: holds for one image size, the images have {len(sizes)} ({shown})")
     try:
-        params = tuple(float(number) for number in config.camera_params.split(","))
+        params = tuple(float(number) for number in given_params.split(","))
     except ValueError:
         raise ConfigError(f"{given}: needed are numbers separated by commas") from None
     needed = pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1).params_info

@@ -58,12 +58,12 @@ def with_masks(collection: ImageCollection, folder: Path) -> ImageCollection:
     return replace(collection, images=images)
 
 
-def masks_of(collection: ImageCollection, folder: str) -> MaskSet | None:
+def masks_of(collection: ImageCollection, folder: Path | None) -> MaskSet | None:
     """What ``with_masks`` found in ``folder``, to be kept with the results; None where no folder is named."""
-    if not folder:
+    if folder is None:
         return None
     digests = {image.name: image.mask.digest for image in collection.images if image.mask is not None}
-    return MaskSet(folder=Path(folder), digest_of=digests)
+    return MaskSet(folder=folder, digest_of=digests)
 
 
 def check_masks(masks: MaskSet, names: Iterable[str]) -> None:

@@ -6,13 +6,14 @@ module to read is ``image_folder``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from smust3r_colmap.colmap.model_files import refuse_names_text_cannot_hold
-from smust3r_colmap.config import RunConfig
+from smust3r_colmap.config import RefineConfig, RunConfig
 from smust3r_colmap.errors import ConfigError
 from smust3r_colmap.execution.run_context import Run
+from smust3r_colmap.execution.task_pool import num_workers
 from smust3r_colmap.importers.colmap_model import ExternalModel
 from smust3r_colmap.importers.fitted_model import FittedModel, fit_to_images
 from smust3r_colmap.importers.image_folder import (
@@ -27,23 +28,14 @@ from smust3r_colmap.importers.masks import names_without_mask, with_masks
 from smust3r_colmap.products import ImageCollection
 
 
-@dataclass(frozen=True, kw_only=True)
-class CameraChoice:
-    """What is to become of the cameras of an external model; see ``fit_to_images``."""
-
-    share: bool = True
-    model: str = ""
-    calibrated: bool = False
-
-
-def check_folders(images: Path, output: Path, config: RunConfig) -> None:
+def check_folders(images: Path, output: Path, masks: Path | None) -> None:
     """Refuse folders that cannot be used, before anything is made or changed.
 
     Raises:
         InputError: there is no image folder, or output or masks lie where the next run would read them as images.
     """
     check_output_not_inside(images, output)
-    check_masks_not_inside(images, config.importing.masks)
+    check_masks_not_inside(images, masks)
     check_image_folder(images)
 
 
@@ -64,15 +56,15 @@ def read_images(run: Run, images: Path, config: RunConfig, *, overwrite: bool) -
         InputError: the images or the settings cannot be used.
     """
     with run.clock.stage("import", total=1) as progress:
-        scan = scan_changed_files(images, run.folder, overwrite=overwrite, workers=config.workers)
-        collection = _checked(run, collection_from_scan(scan, config.importing), config)
+        scan = scan_changed_files(images, run.folder, overwrite=overwrite, workers=num_workers(config.workers))
+        collection = _checked(run, collection_from_scan(scan, config.cameras), config)
         progress.advance()
     _tell_rejected(run, collection)
     return scan, collection
 
 
 def fit_model(
-    run: Run, model: ExternalModel, images: Path, config: RunConfig, cameras: CameraChoice, *, overwrite: bool
+    run: Run, model: ExternalModel, images: Path, config: RefineConfig, *, overwrite: bool
 ) -> tuple[FolderScan, FittedModel]:
     """An external model, its cameras at the size of the image files.
 
@@ -80,14 +72,14 @@ def fit_model(
         InputError: the model, the images or the settings cannot be used.
     """
     with run.clock.stage("import", total=1) as progress:
-        scan = scan_changed_files(images, run.folder, overwrite=overwrite, workers=config.workers)
+        scan = scan_changed_files(images, run.folder, overwrite=overwrite, workers=num_workers(config.workers))
         fitted = fit_to_images(
             model,
             scan,
-            share_cameras=cameras.share,
-            camera_model=cameras.model,
-            calibrated=cameras.calibrated,
-            complete=config.refinement.complete,
+            share_cameras=config.cameras.share_cameras,
+            camera_model=config.cameras.camera_model,
+            calibrated=config.cameras.calibrated,
+            register_missing=config.refinement.register_missing,
         )
         fitted = replace(fitted, collection=_checked(run, fitted.collection, config))
         progress.advance()
@@ -97,13 +89,13 @@ def fit_model(
     return scan, fitted
 
 
-def _checked(run: Run, collection: ImageCollection, config: RunConfig) -> ImageCollection:
+def _checked(run: Run, collection: ImageCollection, config: RunConfig | RefineConfig) -> ImageCollection:
     """With the masks of the folder, where one is named."""
     if config.output.text:
         refuse_names_text_cannot_hold(image.name for image in collection.images)
-    if not config.importing.masks:
+    if config.masks is None:
         return collection
-    masked = with_masks(collection, Path(config.importing.masks))
+    masked = with_masks(collection, config.masks)
     if whole := names_without_mask(masked.images):
         run.clock.warn(f"{len(whole)} of {len(masked)} images have no mask and are used as a whole, such as {whole[0]}")
     return masked

@@ -136,7 +136,7 @@ def _loop_configurations(base: RunConfig, *, oracle: bool) -> Iterator[Configura
         config = replace(base, loop_closing=replace(base.loop_closing, **changes))  # type: ignore[arg-type]
         return Configuration(question="loops", label=label, config=config, false_share=false_share)
 
-    yield with_loops("off", loops=False)
+    yield with_loops("off", loop_closure=False)
     yield with_loops("on")
     yield with_loops("on, no kernel", loop_kernel="none")
     if oracle:
@@ -388,7 +388,7 @@ def plan_segments(backbone: OracleBackbone, config: RunConfig) -> Segments:
         overlap=config.segmentation.overlap,
     )
     closing = config.loop_closing
-    if not closing.loops:
+    if not closing.loop_closure:
         return Segments.of(graph, windows, NOT_LOOKED_FOR)
     loops = plan_loops(
         backbone.describe(),
@@ -397,7 +397,7 @@ def plan_segments(backbone: OracleBackbone, config: RunConfig) -> Segments:
         similarity=closing.loop_similarity,
         min_candidates=closing.loop_min_candidates,
         min_distance=closing.loop_min_distance,
-        half_width=closing.loop_half_width,
+        half_width=closing.loop_window,
     )
     return Segments.of(graph, windows, loops)
 

@@ -75,7 +75,7 @@ from smust3r_colmap.backbones.must3r.memory_plan import MemoryModel, memory_budg
 from smust3r_colmap.backbones.must3r.network import init_memory
 from smust3r_colmap.backbones.must3r.precision import choose_device, choose_precision, prepare
 from smust3r_colmap.backbones.must3r.preprocessing import NetworkImage, preprocess
-from smust3r_colmap.config import CameraFit, Device, ImportConfig, Precision
+from smust3r_colmap.config import CameraConfig, CameraFit, Device, Precision
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.importers.image_folder import import_image_folder
 from smust3r_colmap.importers.images import load_rgb
@@ -209,7 +209,7 @@ def measure(task: Task) -> dict[str, StageCost]:
     mode, device = MODES[task.mode], choose_device(task.device)
     network = load_checkpoint(task.weights, image_size=task.size, memory_mode=mode.memory, device=device)
     network = prepare(network, choose_precision(mode.precision, device).dtype)
-    collection = import_image_folder(task.images, ImportConfig())
+    collection = import_image_folder(task.images, CameraConfig())
     watch = Stopwatch(device=device)
     warm_up(network)
 
@@ -290,7 +290,7 @@ def images_at_once(network: Network, images: Sequence[NetworkImage], mode: Mode,
         MemoryModel(architecture=network.architecture, tokens=tokens, dtype=network.dtype),
         num_images=len(images),
         wanted_keyframes=num_keyframes,
-        budget_bytes=memory_budget(network.device, 0),
+        budget_bytes=memory_budget(network.device, "auto"),
         on_card=on_card,
     )
     return plan.render_batch

@@ -61,7 +61,7 @@ def main(words: Sequence[str] | None = None) -> int:
         backbone="oracle",
         backbone_options=f"preset={arguments.preset}",
         output=OutputConfig(trainer=False, dense=not arguments.no_dense),
-        workers=arguments.workers,
+        workers=arguments.workers or "auto",
     )
     try:
         images = chosen_images(arguments.data, arguments.images, arguments.output)
@@ -93,7 +93,7 @@ def parse_arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--preset", choices=sorted(PRESETS), default="network", help="errors of the oracle (%(default)s)"
     )
-    parser.add_argument("--workers", type=int, default=0, help="processes; 0 takes one per core (%(default)s)")
+    parser.add_argument("--workers", type=int, help="processes; by default one per core")
     parser.add_argument("--no-dense", action="store_true", help="leave out the dense workspace")
     return parser.parse_args(words)
 

@@ -20,8 +20,8 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 import tyro
 
 from smust3r_colmap.cli.demo import Demo
+from smust3r_colmap.cli.doctor import Doctor
 from smust3r_colmap.cli.export import Export
-from smust3r_colmap.cli.main import Doctor
 from smust3r_colmap.cli.reconstruct import Reconstruct
 from smust3r_colmap.cli.refine import Refine
 from smust3r_colmap.cli.validate import Validate
@@ -50,9 +50,10 @@ the same.
 
 ## Settings file
 
-`reconstruct --config FILE.toml` reads settings from a file. The keys are the options with underscores, at the top
-level, without tables; `--no-loops` is `loops = false`. The file overrides the defaults, and options on the command
-line override the file. An unknown key is an error. Every run writes its settings to `config.toml` in the output folder.
+`reconstruct` and `refine` read settings from a file with `--config FILE.toml`. The keys are the options with
+underscores, at the top level, without tables; `--no-loop-closure` is `loop_closure = false`. The file overrides the
+defaults and the preset, and options on the command line override the file. An unknown key is an error. Every run writes
+its settings to `config.toml` in the output folder.
 
 ```toml
 segment_length = 40

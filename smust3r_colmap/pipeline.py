@@ -26,7 +26,7 @@ from smust3r_colmap.config import RunConfig
 from smust3r_colmap.dense import stage as dense
 from smust3r_colmap.execution.progress import Reporter
 from smust3r_colmap.execution.run_context import Run
-from smust3r_colmap.execution.task_pool import usable_cores
+from smust3r_colmap.execution.task_pool import num_workers
 from smust3r_colmap.exporters import registry as exporters
 from smust3r_colmap.exporters.finished_run import begin_stages
 from smust3r_colmap.importers import stage as importers
@@ -60,8 +60,8 @@ def reconstruct(
         ReconstructionError: no segment came out.
         RunDirectoryError: the output folder cannot be used, is held by another run, or the disk refused.
     """
-    importers.check_folders(images, output, config)
-    with Run.open(output, workers=config.workers or usable_cores(), seed=config.seed, reporter=reporter) as run:
+    importers.check_folders(images, output, config.masks)
+    with Run.open(output, workers=num_workers(config.workers), seed=config.seed, reporter=reporter) as run:
         scan, collection = importers.read_images(run, images, config, overwrite=overwrite)
         backbone = backbones.make(run, factory, collection, config)
         begin_stages(run, scan, overwrite=overwrite)
@@ -70,7 +70,7 @@ def reconstruct(
         edges = alignment.align(run, submodels, segments, config.alignment)
         stitched = stitching.stitch(run, submodels, edges, segments, collection, config.alignment, config.loop_closing)
         initial = refinement.InitialScenes.of(stitched, segments, maps_key=submodels.dense_key)
-        refined = refinement.refine(run, initial, collection, submodels.features, config.refinement, config.classical)
+        refined = refinement.refine(run, initial, collection, submodels.features, config.refinement, config.features)
         fused = dense.fuse(run, submodels, segments, stitched, refined, config.fusion)
         outputs = exporters.export(run, fused, refined, initial, images, collection, config, before=stitched.before)
         return report.reconstruction(run, collection, segments, submodels, edges, stitched, refined, fused, outputs)

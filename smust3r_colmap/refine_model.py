@@ -15,17 +15,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from smust3r_colmap.config import RunConfig
+from smust3r_colmap.config import RefineConfig, SegmentationConfig
 from smust3r_colmap.dense.external_points import fuse_external
 from smust3r_colmap.execution.progress import Reporter
 from smust3r_colmap.execution.run_context import Run
-from smust3r_colmap.execution.task_pool import usable_cores
+from smust3r_colmap.execution.task_pool import num_workers
 from smust3r_colmap.exporters import registry as exporters
 from smust3r_colmap.exporters.finished_run import begin_stages
 from smust3r_colmap.features.stage import match_external
 from smust3r_colmap.importers import stage as importers
 from smust3r_colmap.importers.colmap_model import read_colmap_model
-from smust3r_colmap.importers.stage import CameraChoice
 from smust3r_colmap.refinement import stage as refinement
 from smust3r_colmap.report import summarise as report
 from smust3r_colmap.report.summary import RunSummary
@@ -35,10 +34,8 @@ def refine_model(
     model: Path,
     images: Path,
     output: Path,
-    config: RunConfig,
+    config: RefineConfig,
     *,
-    cameras: CameraChoice,
-    pose_tolerance: float,
     overwrite: bool = False,
     reporter: Reporter,
 ) -> RunSummary:
@@ -48,12 +45,8 @@ def refine_model(
         model: folder of the model; it is only read.
         images: folder of its images.
         output: made when missing; what an earlier start finished there is used.
-        config: ``importing.masks``, ``classical`` (features), ``refinement`` (with ``complete`` also images of the
-            folder that the model lacks are placed), ``output``, ``segmentation`` (subsets of large models),
-            ``workers`` and ``seed`` are used.
-        cameras: what is to become of the cameras.
-        pose_tolerance: how far from its epipolar line a match may lie at first, as a fraction of the longer image
-            side.
+        config: what becomes of the cameras, how far the poses may be off, and the settings of the stages. With
+            ``register_missing`` images of the folder that the model lacks are tried, too.
         overwrite: start over.
         reporter: told about every stage.
 
@@ -61,23 +54,22 @@ def refine_model(
         InputError: the model, the images or the settings cannot be used.
         RunDirectoryError: the output folder cannot be used, is held by another run, or the disk refused.
     """
-    importers.check_folders(images, output, config)
+    importers.check_folders(images, output, config.masks)
     external = read_colmap_model(model)
     importers.check_model_is_kept(external.folder, output)
-    with Run.open(output, workers=config.workers or usable_cores(), seed=config.seed, reporter=reporter) as run:
-        scan, fitted = importers.fit_model(run, external, images, config, cameras, overwrite=overwrite)
+    with Run.open(output, workers=num_workers(config.workers), seed=config.seed, reporter=reporter) as run:
+        scan, fitted = importers.fit_model(run, external, images, config, overwrite=overwrite)
         begin_stages(run, scan, overwrite=overwrite)
         start = fitted.scene(origin=external.folder.name)
         features = match_external(
-            run, fitted.collection, start, config.classical, per_image=config.refinement.track_neighbours
+            run, fitted.collection, start, config.features, per_image=config.refinement.track_neighbours
         )
         initial = refinement.InitialScenes.of_external(
-            start, fitted.seen_by_tracks(), config.segmentation, tolerance=pose_tolerance
+            start, fitted.seen_by_tracks(), SegmentationConfig(), tolerance=config.pose_tolerance
         )
         refined = refinement.refine_external(
-            run, initial, fitted.collection, features, config.refinement, config.classical
+            run, initial, fitted.collection, features, config.refinement, config.features
         )
         fused = fuse_external(run, start, fitted.untracked_points, refined)
         outputs = exporters.export(run, (fused,), refined, initial, images, fitted.collection, config, before={})
-        settings = {"cameras": cameras, "pose_tolerance": pose_tolerance, "config": config}
-        return report.refined_model(run, fitted, features, refined, fused, outputs, settings)
+        return report.refined_model(run, fitted, features, refined, fused, outputs, config)

@@ -71,7 +71,7 @@ def make_backbone(context: BackboneContext) -> Backbone:
     """
     known = find_backbone(context.config.backbone)
     plugin = load_plugin(known)
-    made = plugin.make(context, parse_options(context.config.backbone_options, plugin.options, known.name))
+    made = plugin.make(context, parse_options(context.config.backbone_options or "", plugin.options, known.name))
     _refuse_incomplete(made, known)
     return made
 

@@ -9,17 +9,17 @@ from typing import Annotated
 import tyro
 
 from smust3r_colmap.cli.console import reporting, tell
-from smust3r_colmap.config import ClassicalConfig, RunConfig, SegmentationConfig
+from smust3r_colmap.config import FeatureConfig, RunConfig, SegmentationConfig
 from smust3r_colmap.errors import InputError
 from smust3r_colmap.execution.progress import Reporter
-from smust3r_colmap.report.summary import EXIT_WEAK
+from smust3r_colmap.report.summary import EXIT_DEGRADED
 
 # Position error of the demo, in percent of the path's extent, above which something is broken; a
 # tenth of a percent is usual.
 _DEMO_WEAK_PERCENT = 5.0
 # The demo's walls are covered with texture; a quarter of the features does, in a third of the time.
 _DEMO_SETTINGS = RunConfig(
-    classical=ClassicalConfig(max_features=1500),
+    features=FeatureConfig(max_features=1500),
     segmentation=SegmentationConfig(segment_length=20, overlap=10),  # enough segments for a loop
 )
 
@@ -68,5 +68,5 @@ def _demo(command: Demo, reporter: Reporter) -> int:
     print(f"Cameras of {model} against the truth in {truth_file}:\n  {distance.render_text('m')}")
     if distance.position_rmse_percent > _DEMO_WEAK_PERCENT:
         reporter.warn(f"that is more than {_DEMO_WEAK_PERCENT:.0f} %: the result is wrong")
-        return EXIT_WEAK
+        return EXIT_DEGRADED
     return summary.exit_code

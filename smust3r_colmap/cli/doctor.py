@@ -7,6 +7,7 @@ changed or fetched.
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import subprocess
@@ -14,12 +15,16 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from importlib import metadata
-from typing import Any
+from typing import Annotated, Any
+
+import tyro
 
 from smust3r_colmap import __version__
 from smust3r_colmap.backbones.registry import OUR_PACKAGE, KnownBackbone, list_backbones
+from smust3r_colmap.cli.console import EXIT_FAILED
 from smust3r_colmap.errors import advice_for
 from smust3r_colmap.execution.task_pool import usable_cores
+from smust3r_colmap.report.summary import EXIT_GOOD
 
 _IMPORT_TIMEOUT_S = 120.0
 
@@ -65,7 +70,7 @@ from smust3r_colmap.backbones.weights.cache import find_weights
 for line in describe_precision():
     print(line)
 try:
-    print(f"weights: {find_weights('', Must3rConfig().network_size)}")
+    print(f"weights: {find_weights(None, Must3rConfig().network_size)}")
 except CheckpointError as error:
     print(error)
 """,
@@ -74,6 +79,23 @@ except CheckpointError as error:
 
 # The backbone that works without anything else; the others may be broken.
 _NEEDED_BACKBONE = "classical"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Doctor:
+    """Say what this machine has, what works on it and what is missing."""
+
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print JSON."""
+    verbose: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the traceback of an unexpected error."""
+
+
+def run_doctor(command: Doctor) -> int:
+    """Examine the machine, print what was found; the exit code."""
+    diagnosis = examine()
+    print(json.dumps(diagnosis.to_json_dict(), indent=1) if command.json else diagnosis.render_text())
+    return EXIT_GOOD if diagnosis.healthy else EXIT_FAILED
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import tyro
 
+from smust3r_colmap.cli.console import reporting
 from smust3r_colmap.config import OutputConfig
 from smust3r_colmap.errors import ConfigError, InputError
-from smust3r_colmap.execution.progress import Reporter
+from smust3r_colmap.report.summary import EXIT_GOOD
 
 if TYPE_CHECKING:
     from smust3r_colmap.exporters.finished_run import FinishedRun
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
 FormatName = Literal["sparse", "database", "ply", "glb", "tum", "trainer", "dense", "mesh", "list"]
 
-_EXIT_GOOD = 0
 _LIST = "list"
 
 
@@ -47,7 +47,7 @@ class Export:
     """Where the images of the run are now, if the folder has moved."""
     text: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """sparse: write the COLMAP models as .txt beside the .bin files."""
-    trainer_scales: str = ""
+    trainer_scales: tuple[int, ...] | None = None
     """trainer: smaller copies of the images, such as 2,4,8 for images_2, images_4 and images_8."""
     masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """trainer: masks named IMAGE.png after the image, or by its stem; black is ignored. By default those of the run."""
@@ -61,7 +61,7 @@ class Export:
     """Print what the stages log, and the traceback of an unexpected error."""
 
 
-def run_export(command: Export, reporter: Reporter) -> int:
+def run_export(command: Export) -> int:
     """Write the formats, print what was written, and return the exit code.
 
     Raises:
@@ -77,7 +77,7 @@ def run_export(command: Export, reporter: Reporter) -> int:
     if _LIST in (*command.format, taken_for_run):
         width = max(map(len, FORMATS))
         print("\n".join(f"{name:{width}}  {one.about}" for name, one in FORMATS.items()))
-        return _EXIT_GOOD
+        return EXIT_GOOD
     if taken_for_run:
         raise ConfigError(
             f"RUN is missing: {taken_for_run!r} is a format and no folder; "
@@ -86,7 +86,10 @@ def run_export(command: Export, reporter: Reporter) -> int:
     settings = _settings(command)
     names = [name for name in FORMATS if name in command.format]
     check_is_finished(command.run)
-    with RunDirectory(command.run) as run:
+    with (
+        reporting(quiet=command.quiet, verbose=command.verbose) as reporter,
+        RunDirectory(command.run) as run,
+    ):
         finished = open_finished(run, images=command.images, output=command.output)
         _check_before(run, finished, names, settings)
         for name in names:
@@ -97,7 +100,7 @@ def run_export(command: Export, reporter: Reporter) -> int:
                 print(finished.output / written.name)
                 for note in written.notes:
                     print(f"  {note}")
-    return _EXIT_GOOD
+    return EXIT_GOOD
 
 
 def _format_taken_for_run(command: Export) -> str:
@@ -113,7 +116,7 @@ def _settings(command: Export) -> FormatSettings:
         raise ConfigError("--format: name at least one format; --format list says which there are")
     return FormatSettings(
         text=command.text,
-        trainer_scales=OutputConfig(trainer_scales=command.trainer_scales).trainer_factors,
+        trainer_scales=OutputConfig(trainer_scales=command.trainer_scales).trainer_scales or (),
         masks=command.masks,
         keep_outliers=command.keep_outliers,
         mesh=command.mesh,

@@ -1,54 +1,49 @@
-"""The command line: ``reconstruct``, ``demo`` and ``doctor``; the other commands are in ``*_command``.
+"""The command line: what was typed becomes a command with its settings, and the command is run.
 
-Flags, exit codes and printing live in these modules and nowhere else; the set-up of logging lives here.
-Settings come from the defaults, then the TOML file, then the flags. What a command needs is
-imported when the command runs, so that ``--help`` answers at once.
+Settings come from the defaults, then the preset, then the TOML file, then the flags. There is one file per command
+beside this one; ``fields`` says how their dataclasses become flags. What a command needs is imported when it runs,
+so that ``--help`` answers at once.
 
-Exit codes: 0 good, 1 failed, 2 wrong use, 3 finished but the result is weak, 130 interrupted.
+Exit codes: 0 good, 1 failed, 2 wrong use, 3 finished with warnings, 130 interrupted.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import difflib
 import sys
 import traceback
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import tyro
 
 from smust3r_colmap import __version__
-from smust3r_colmap.cli.console import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail, reporting, tell
+from smust3r_colmap.cli.console import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail
 from smust3r_colmap.cli.demo import Demo, run_demo
+from smust3r_colmap.cli.doctor import Doctor, run_doctor
 from smust3r_colmap.cli.export import Export, run_export
+from smust3r_colmap.cli.fields import REGISTRY
+from smust3r_colmap.cli.presets import PRESETS
 from smust3r_colmap.cli.reconstruct import Reconstruct, run_reconstruct
 from smust3r_colmap.cli.refine import Refine, run_refine
 from smust3r_colmap.cli.validate import Validate, run_validate
-from smust3r_colmap.cli.weights import WeightsAction, WeightsCommand, run_weights
+from smust3r_colmap.cli.weights import WeightsCommand, run_weights
+from smust3r_colmap.config import RefineConfig, RunConfig
 from smust3r_colmap.errors import ConfigError, InputError, SmustrError
 from smust3r_colmap.report.summary import EXIT_GOOD
 from smust3r_colmap.storage.config_file import flags_from_settings, read_settings
 
 _DESCRIPTION = """Offline structure from motion for COLMAP workflows, segment by segment.
 
-Exit codes: 0 good, 1 failed, 2 wrong use, 3 finished but the result is weak, 130 interrupted.
+Exit codes: 0 good, 1 failed, 2 wrong use, 3 finished with warnings, 130 interrupted.
 --version prints the version."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class Doctor:
-    """Say what this machine has, what works on it and what is missing."""
-
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print JSON."""
-    verbose: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print the traceback of an unexpected error."""
-
-
 Command = Reconstruct | Refine | Export | Validate | Demo | Doctor | WeightsCommand
+
+COMMANDS = ("reconstruct", "refine", "export", "validate", "demo", "doctor", "weights")
+SETTINGS = {"reconstruct": RunConfig, "refine": RefineConfig}
+"""The commands that take a settings file, and what it may hold."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -65,30 +60,38 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def parse(arguments: Sequence[str]) -> Command:
-    """The command with all its settings: defaults, then the file after ``--config``, then flags.
+    """The command with all its settings: defaults, then the preset, then the file after ``--config``, then flags.
 
     Raises:
-        ConfigError: the file or a setting is not as it should be.
+        ConfigError: there is no such command, or the file or a setting is not as it should be.
         SystemExit: the flags are wrong (2), or help was asked for (0).
     """
+    if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
+        near = difflib.get_close_matches(arguments[0], COMMANDS, n=1)
+        meant = f"; did you mean {near[0]}?" if near else ""
+        raise ConfigError(f"there is no command {arguments[0]!r}{meant} The commands are {', '.join(COMMANDS)}")
     command: Command = tyro.cli(
         Command,
         prog="smust3r-colmap",
         description=_DESCRIPTION,
-        args=_with_settings_of_file(arguments),
+        args=_with_preset_and_file(arguments),
+        registry=REGISTRY,
     )
     return command
 
 
-def _with_settings_of_file(arguments: Sequence[str]) -> list[str]:
-    """The settings of the file as flags before those that were typed: of two equal flags the last counts."""
-    if arguments[:1] != ["reconstruct"]:
+def _with_preset_and_file(arguments: Sequence[str]) -> list[str]:
+    """Their settings as flags before those that were typed: of two equal flags the last counts."""
+    name = arguments[0] if arguments else ""
+    if name not in SETTINGS:
         return list(arguments)
-    finder = argparse.ArgumentParser(prog="smust3r-colmap reconstruct", add_help=False, allow_abbrev=False)
+    finder = argparse.ArgumentParser(prog=f"smust3r-colmap {name}", add_help=False, allow_abbrev=False)
     finder.add_argument("--config", type=Path)
-    path = finder.parse_known_args(arguments)[0].config
-    from_file = [] if path is None else flags_from_settings(read_settings(path))
-    return ["reconstruct", *from_file, *arguments[1:]]
+    finder.add_argument("--preset")
+    found = finder.parse_known_args(arguments)[0]
+    of_preset = flags_from_settings(PRESETS.get(found.preset, {})) if name == "reconstruct" else []
+    of_file = [] if found.config is None else flags_from_settings(read_settings(found.config, SETTINGS[name]))
+    return [name, *of_preset, *of_file, *arguments[1:]]
 
 
 def _run_guarded(command: Command) -> int:
@@ -107,41 +110,19 @@ def _run_guarded(command: Command) -> int:
         return fail(f"unexpected {type(error).__name__}: {error}. This is a defect; --verbose shows where", EXIT_FAILED)
 
 
-def _run(command: Command) -> int:
+def _run(command: Command) -> int:  # noqa: PLR0911  (one return per command)
     match command:
         case Reconstruct():
-            exit_code = run_reconstruct(command)
+            return run_reconstruct(command)
         case Refine():
-            exit_code = _run_refine(command)
+            return run_refine(command)
         case Export():
-            with reporting(quiet=command.quiet, verbose=command.verbose) as reporter:
-                exit_code = run_export(command, reporter)
+            return run_export(command)
         case Validate():
-            exit_code = run_validate(command)
+            return run_validate(command)
         case Demo():
-            exit_code = run_demo(command)
+            return run_demo(command)
         case Doctor():
-            exit_code = _run_doctor(command)
+            return run_doctor(command)
         case _:
-            exit_code = _run_weights(command)
-    return exit_code
-
-
-def _run_refine(command: Refine) -> int:
-    with reporting(quiet=command.quiet, verbose=command.verbose) as reporter:
-        summary = run_refine(command, reporter)
-        tell(summary, reporter, quiet=command.quiet)
-        return summary.exit_code
-
-
-def _run_weights(action: WeightsAction) -> int:
-    with reporting(quiet=action.quiet, verbose=action.verbose) as reporter:
-        return run_weights(action, reporter)
-
-
-def _run_doctor(command: Doctor) -> int:
-    from smust3r_colmap.cli.doctor import examine  # noqa: PLC0415  (needed by this command only)
-
-    diagnosis = examine()
-    print(json.dumps(diagnosis.to_json_dict(), indent=1) if command.json else diagnosis.render_text())
-    return EXIT_GOOD if diagnosis.healthy else EXIT_FAILED
+            return run_weights(command)

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from smust3r_colmap.cli.console import reporting, tell
+from smust3r_colmap.cli.presets import Preset
 from smust3r_colmap.config import RunConfig
 
 
@@ -21,7 +22,10 @@ class Reconstruct:
     output: Annotated[Path, tyro.conf.arg(metavar="OUT")]
     """Folder of the result; made when missing."""
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None
-    """Settings, such as segment_length = 40; flags override them."""
+    """Settings, such as segment_length = 40; flags override them. OUT/config.toml of a run can be given back."""
+    preset: Preset = "default"
+    """Settings that go together, for speed (fast) or for most images and detail (thorough); the file after --config
+    and flags override them."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Throw away what an earlier run left in OUT."""
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False

@@ -38,12 +38,11 @@ from smust3r_colmap.backbones.weights.catalogue import (
     official,
 )
 from smust3r_colmap.backbones.weights.checksum import verify
+from smust3r_colmap.cli.console import EXIT_FAILED, fail, reporting
 from smust3r_colmap.config import Must3rConfig
 from smust3r_colmap.errors import CheckpointError, ConfigError
 from smust3r_colmap.execution.progress import Reporter
-
-_EXIT_GOOD = 0
-_EXIT_FAILED = 1
+from smust3r_colmap.report.summary import EXIT_GOOD
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,8 +77,8 @@ class VerifyWeights(WeightsAction):
     """Compare files with the published sums; exit code 1 if one is not as published."""
 
     file: Annotated[
-        tyro.conf.Positional[str], tyro.conf.arg(metavar="[FILE|NAME]", help_behavior_hint="(optional)")
-    ] = ""
+        tyro.conf.Positional[str | None], tyro.conf.arg(metavar="[FILE|NAME]", help_behavior_hint="(optional)")
+    ] = None
     """A file, or an official name in the cache; without it, all official files in the cache."""
 
 
@@ -100,7 +99,9 @@ class ConvertWeights(WeightsAction):
 class PathOfWeights(WeightsAction):
     """Print the file that `reconstruct --backbone must3r` would take; exit code 1 if there is none."""
 
-    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[NAME]", help_behavior_hint="(optional)")] = ""
+    name: Annotated[
+        tyro.conf.Positional[str | None], tyro.conf.arg(metavar="[NAME]", help_behavior_hint="(optional)")
+    ] = None
     """An official name: where that file lies in the cache."""
     network_size: int = Must3rConfig.network_size
     """Of the run; up to 224 it takes another network."""
@@ -116,8 +117,13 @@ WeightsCommand = Annotated[
 ]
 
 
-def run_weights(action: WeightsAction, reporter: Reporter) -> int:
+def run_weights(action: WeightsAction) -> int:
     """Run one of the commands and return its exit code; errors leave as they are."""
+    with reporting(quiet=action.quiet, verbose=action.verbose) as reporter:
+        return _run(action, reporter)
+
+
+def _run(action: WeightsAction, reporter: Reporter) -> int:
     match action:
         case FetchWeights():
             return _fetch(action, reporter)
@@ -138,7 +144,7 @@ def _list() -> int:
     print(f"\nThe cache is {weights_folder()}.")
     print(f"{WEIGHTS_VARIABLE} is {os.environ.get(WEIGHTS_VARIABLE) or 'not set'}.")
     print("The files have a licence of their own, non-commercial; `weights fetch` shows what it says.")
-    return _EXIT_GOOD
+    return EXIT_GOOD
 
 
 def _state(file: OfficialFile) -> str:
@@ -167,17 +173,16 @@ def _fetch(action: FetchWeights, reporter: Reporter) -> int:
         if decision.sound:
             reporter.note(decision.text)
             print(target)
-            return _EXIT_GOOD
+            return EXIT_GOOD
         reporter.warn(decision.text)
     print(f"{LICENCE_SUMMARY}\n", file=sys.stderr)
     if not action.accept_licence and not _consents(file):
-        print("smust3r-colmap: the licence was not accepted; nothing was fetched", file=sys.stderr)
-        return _EXIT_FAILED
+        return fail("the licence was not accepted; nothing was fetched", EXIT_FAILED)
     download(f"{action.base_url.rstrip('/')}/{file.name}", target, md5=file.md5, reporter=reporter)
     if file.kind == "network":
         reporter.note(f"`smust3r-colmap weights convert {file.name}` makes of it a file that opens at once")
     print(target)
-    return _EXIT_GOOD
+    return EXIT_GOOD
 
 
 def _consents(file: OfficialFile) -> bool:
@@ -195,20 +200,20 @@ def _consents(file: OfficialFile) -> bool:
 
 
 def _verify(action: VerifyWeights) -> int:
-    if not action.file:
+    if action.file is None:
         paths = [path for path in map(published_place, CATALOGUE) if path.is_file()]
         if not paths:
-            return _fail(f"{weights_folder()}: has no official file; {fetch_advice(official(RECOMMENDED))}")
+            return fail(f"{weights_folder()}: has no official file; {fetch_advice(official(RECOMMENDED))}", EXIT_FAILED)
     elif Path(action.file).is_file():
         paths = [Path(action.file)]
     else:
         paths = [published_place(official(action.file))]
         if not paths[0].is_file():
-            return _fail(f"{paths[0]}: is not there; {fetch_advice(official(action.file))}")
+            return fail(f"{paths[0]}: is not there; {fetch_advice(official(action.file))}", EXIT_FAILED)
     decisions = [verify(path) for path in paths]
     for decision in decisions:
         print(decision.text)
-    return _EXIT_GOOD if all(decision.sound for decision in decisions) else _EXIT_FAILED
+    return EXIT_GOOD if all(decision.sound for decision in decisions) else EXIT_FAILED
 
 
 def _convert(action: ConvertWeights, reporter: Reporter) -> int:
@@ -227,24 +232,19 @@ def _convert(action: ConvertWeights, reporter: Reporter) -> int:
     reporter.note(f"converting {source}")
     convert_checkpoint(source, target)
     print(target)
-    return _EXIT_GOOD
+    return EXIT_GOOD
 
 
 def _path(action: PathOfWeights) -> int:
-    if not action.name:
+    if action.name is None:
         try:
-            print(find_weights("", action.network_size))
+            print(find_weights(None, action.network_size))
         except CheckpointError as error:  # a question that was answered, not wrong use
-            return _fail(str(error))
-        return _EXIT_GOOD
+            return fail(str(error), EXIT_FAILED)
+        return EXIT_GOOD
     file = official(action.name)
     found = find_cached(file)
     if found is None:
-        return _fail(f"{file.name}: is not in the cache {weights_folder()}; {fetch_advice(file)}")
+        return fail(f"{file.name}: is not in the cache {weights_folder()}; {fetch_advice(file)}", EXIT_FAILED)
     print(found)
-    return _EXIT_GOOD
-
-
-def _fail(text: str) -> int:
-    print(f"smust3r-colmap: {text}", file=sys.stderr)
-    return _EXIT_FAILED
+    return EXIT_GOOD

@@ -22,7 +22,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, Literal, Protocol, TypeVar
 
 from smust3r_colmap.errors import SmustrError, StorageError
 
@@ -58,6 +58,11 @@ class TaskResult(Generic[ResultT]):
 
     index: int
     value: ResultT | TaskFailure
+
+
+def num_workers(wanted: int | Literal["auto"]) -> int:
+    """Processes for the setting ``workers``: auto is one per core that this process may use."""
+    return usable_cores() if wanted == "auto" else wanted
 
 
 def usable_cores() -> int:

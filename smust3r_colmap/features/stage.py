@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from smust3r_colmap.colmap.database import create_database, open_database
-from smust3r_colmap.config import ClassicalConfig
+from smust3r_colmap.config import FeatureConfig
 from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.features.matching import match_pairs
@@ -23,7 +23,7 @@ from smust3r_colmap.storage.run_directory import key_of
 _DESCRIPTORS: Codec[Float32Array] = Codec(Float32Array, "descriptors")
 
 
-def features_of_run(run: Run, collection: ImageCollection, options: ClassicalConfig) -> RunFeatures:
+def features_of_run(run: Run, collection: ImageCollection, options: FeatureConfig) -> RunFeatures:
     """Extract what no earlier start extracted; a second call finds everything done."""
     images = [(image.digest, image.width, image.height, image.camera) for image in collection.images]
     settings = (options.max_image_size, options.max_features, run.seed)
@@ -81,7 +81,7 @@ def describe_images(run: Run, features: RunFeatures) -> Float32Array:
 
 
 def match_external(
-    run: Run, collection: ImageCollection, scene: Scene, options: ClassicalConfig, *, per_image: int
+    run: Run, collection: ImageCollection, scene: Scene, options: FeatureConfig, *, per_image: int
 ) -> RunFeatures:
     """SIFT of all images, and the matches that no surface chooses, for a model of another program.
 

@@ -18,7 +18,7 @@ import numpy as np
 import pycolmap
 
 from smust3r_colmap.colmap.database import open_database
-from smust3r_colmap.config import ClassicalConfig, RefinementConfig, SegmentationConfig
+from smust3r_colmap.config import FeatureConfig, RefinementConfig, SegmentationConfig, TrackConfig
 from smust3r_colmap.errors import ConfigError
 from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.execution.run_context import Run
@@ -150,7 +150,7 @@ def refine(
     collection: ImageCollection,
     features: RunFeatures | None,
     options: RefinementConfig,
-    feature_options: ClassicalConfig,
+    feature_options: FeatureConfig,
 ) -> Refinement | None:
     """Find tracks across each scene and adjust it to them; None where that is not wanted.
 
@@ -166,7 +166,7 @@ def refine(
     """
     if not options.refine:
         return None
-    source = options.tracks
+    source = options.track_source
     if initial.maps is None and source != "features":
         raise ConfigError(f"--track-source {source}: the model has no depth maps; take features")
     seen = initial.seen()
@@ -196,7 +196,7 @@ def refine(
                 principal_point=options.principal_point,
                 threads=max(1, run.executor.workers // WORKERS_PER_THREAD),
                 tolerance=initial.tolerance,
-                complete=options.complete,
+                complete=options.register_missing,
             )
             outcome = in_child(refine_scenes, task, log_file=run.folder.native_log)
             stage.advance()
@@ -217,14 +217,14 @@ def refine_external(
     initial: InitialScenes,
     collection: ImageCollection,
     features: RunFeatures,
-    options: RefinementConfig,
-    feature_options: ClassicalConfig,
+    options: TrackConfig,
+    feature_options: FeatureConfig,
 ) -> Refinement:
     """As ``refine``, with a warning where the poses may mean something else than COLMAP's.
 
     Poses of another convention look like any others, but hardly a match agrees with them.
     """
-    refinement = refine(run, initial, collection, features, replace(options, refine=True), feature_options)
+    refinement = refine(run, initial, collection, features, RefinementConfig(**vars(options)), feature_options)
     assert refinement is not None, "it was wanted"
     (figures,) = refinement.figures
     if figures.kept and figures.num_refused_pairs <= figures.num_pairs:

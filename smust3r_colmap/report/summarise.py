@@ -13,6 +13,7 @@ import pycolmap
 from smust3r_colmap.alignment.stage import summarise_edges
 from smust3r_colmap.backbones.base import BackboneResult
 from smust3r_colmap.backbones.stage import summarise_segments
+from smust3r_colmap.config import RefineConfig
 from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.execution.stage_clock import peak_memory_bytes
 from smust3r_colmap.exporters.registry import Outputs
@@ -84,7 +85,7 @@ def refined_model(
     refinement: Refinement,
     fused: FusedScene,
     outputs: Outputs,
-    settings: Mapping[str, object],
+    settings: RefineConfig,
 ) -> RunSummary:
     """What came out of ``refine_model``, in the same form; nothing was segmented or stitched there."""
     placed = _registered([fused])

@@ -25,7 +25,7 @@ SCHEMA_VERSION = 2
 """Of ``summary.json``; raised when a name in it changes its meaning or goes."""
 
 EXIT_GOOD = 0
-EXIT_WEAK = 3
+EXIT_DEGRADED = 3
 
 # More names than this are counted, not listed, in the text for people; the JSON has them all.
 _NAMES_SHOWN = 5
@@ -225,7 +225,7 @@ class RunSummary:
     @property
     def exit_code(self) -> int:
         """For the shell: good, or finished but weak."""
-        return EXIT_WEAK if self.weak_reasons else EXIT_GOOD
+        return EXIT_DEGRADED if self.weak_reasons else EXIT_GOOD
 
     def to_json_dict(self) -> dict[str, Any]:
         """For ``summary.json``: numbers, strings, lists and null only; NaN becomes null.

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -134,7 +135,7 @@ def plan_loops(
     graph: ViewGraph,
     windows: Sequence[Segment],
     *,
-    similarity: float,
+    similarity: float | Literal["auto"],
     min_candidates: int,
     min_distance: int,
     half_width: int,
@@ -145,7 +146,7 @@ def plan_loops(
         descriptors: (N, D) one unit vector per image; zero rows take no part.
         graph: the order of the N images.
         windows: segments of the sequence, ``windows[k].index == k``.
-        similarity: cosine from which two images look alike; 0 takes it from the collection.
+        similarity: cosine from which two images look alike; auto takes it from the collection.
         min_candidates: image pairs that two segments need.
         min_distance: segments closer than this in order are no loop.
         half_width: images before and after each end in the loop segment.
@@ -156,7 +157,7 @@ def plan_loops(
     num_images = graph.num_images
     check_descriptors(descriptors, num_images)
     statistics = similarity_statistics(descriptors, graph)
-    if similarity > 0:
+    if similarity != "auto":
         compared, threshold, weak, reach = descriptors, similarity, similarity, 0
     elif statistics is None:
         return _nothing_planned(statistics, "too few images have descriptors to tell far from near")

@@ -84,7 +84,7 @@ def plan(
     """
     graph = ViewGraph.chain(num_images)
     windows = plan_windows(graph, segment_length=segmentation.segment_length, overlap=segmentation.overlap)
-    if not loop_closing.loops:
+    if not loop_closing.loop_closure:
         return Segments.of(graph, windows, NOT_LOOKED_FOR)
     descriptors = describe()
 
@@ -96,7 +96,7 @@ def plan(
             similarity=loop_closing.loop_similarity,
             min_candidates=loop_closing.loop_min_candidates,
             min_distance=loop_closing.loop_min_distance,
-            half_width=loop_closing.loop_half_width,
+            half_width=loop_closing.loop_window,
         )
         progress.advance()
         return planned

@@ -298,7 +298,7 @@ def test_a_whole_run_gives_the_true_trajectory(room: Room, checkpoint: Path, tmp
         backbone="vggt",
         backbone_options=f"checkpoint={checkpoint},size={SIZE}",
         segmentation=SegmentationConfig(segment_length=6, overlap=3),
-        loop_closing=LoopConfig(loops=False),
+        loop_closing=LoopConfig(loop_closure=False),
         refinement=RefinementConfig(refine=False),  # the photographs of this room have nothing for SIFT
         output=OutputConfig(trainer=False, dense=False),
     )

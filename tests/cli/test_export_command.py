@@ -19,6 +19,7 @@ from helpers.summaries import GOOD
 from PIL import Image
 
 from smust3r_colmap.cli.export import Export, FormatName, run_export
+from smust3r_colmap.cli.fields import REGISTRY
 from smust3r_colmap.errors import (
     CollectionError,
     ConfigError,
@@ -38,8 +39,8 @@ from smust3r_colmap.storage.run_directory import RunDirectory
 
 
 def export(*arguments: str | Path) -> int:
-    command = tyro.cli(Export, args=[str(argument) for argument in arguments])
-    return run_export(command, QuietReporter(sys.stderr))
+    command = tyro.cli(Export, args=[str(argument) for argument in arguments], registry=REGISTRY)
+    return run_export(command)
 
 
 @pytest.fixture

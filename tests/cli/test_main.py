@@ -167,7 +167,6 @@ def test_verbose_shows_where_an_unexpected_error_came_from(
     "argv",
     [
         [],
-        ["rekonstruct"],
         ["reconstruct", "photos"],
         [*RECONSTRUCT, "--no-such-flag"],
         [*RECONSTRUCT, "--segment-length", "many"],

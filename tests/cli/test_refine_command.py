@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-import tyro
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from smust3r_colmap.cli.refine import Refine, run_refine
+from smust3r_colmap.cli import main as cli
+from smust3r_colmap.cli.refine import Refine
+from smust3r_colmap.config import FeatureConfig, ModelCameraConfig, ModelOutputConfig, RefineConfig, TrackConfig
 from smust3r_colmap.dense.external_points import refined_from_start
 from smust3r_colmap.errors import ConfigError, InputError
 from smust3r_colmap.evaluation.readers import read_reference_sparse
@@ -28,6 +29,7 @@ from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import pointmap_from_depth
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
 from smust3r_colmap.products import EMPTY_CLOUD, Scene
+from smust3r_colmap.refine_model import refine_model
 from smust3r_colmap.report.summary import RunSummary
 from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
 from smust3r_colmap.validation.surroundings import read_ply
@@ -39,6 +41,8 @@ CAMERA = demo_intrinsics(320, 240)
 NETWORK_SIZE = (518, 392)
 """518 wide, and the height rounded to a multiple of 14 from 388.5."""
 
+
+MODEL_ONLY = ModelOutputConfig(trainer=False)
 
 LACKING = ("003.png", "006.png")
 """Images that a model may lack."""
@@ -111,11 +115,14 @@ def export(tmp_path_factory: pytest.TempPathFactory) -> Export:
 
 
 def command(export: Export, output: Path) -> Refine:
-    return Refine(model=export.model, images=export.images, output=output, max_features=800, workers=1)
+    settings = RefineConfig(features=FeatureConfig(max_features=800), workers=1, output=MODEL_ONLY)
+    return Refine(model=export.model, images=export.images, output=output, settings=settings)
 
 
 def refined(wanted: Refine) -> RunSummary:
-    return run_refine(wanted, QuietReporter(io.StringIO()))
+    return refine_model(
+        wanted.model, wanted.images, wanted.output, wanted.settings, reporter=QuietReporter(io.StringIO())
+    )
 
 
 @pytest.fixture(scope="module")
@@ -172,14 +179,21 @@ def test_everything_that_was_assumed_is_in_the_summary(result: RunSummary) -> No
 def test_the_files_are_those_of_a_reconstruction(result: RunSummary) -> None:
     names = {path.name for path in result.output.iterdir()}
     assert names >= {"points.ply", "scene.glb", "trajectory_tum.txt", "trajectory_stitched_tum.txt"}
-    assert not names & {"trainer", "dense", "config.toml"}
+    assert "config.toml" in names and not names & {"trainer", "dense"}
 
 
 def test_the_settings_are_in_the_summary(result: RunSummary) -> None:
     settings = json.loads((result.output / "summary.json").read_text())["settings"]
     assert settings["pose_tolerance"] == 0.03
-    assert settings["cameras"] == {"share": True, "model": "", "calibrated": False}
-    assert settings["config"]["classical"]["max_features"] == 800
+    assert settings["cameras"] == {"share_cameras": True, "camera_model": None, "calibrated": False}
+    assert settings["features"]["max_features"] == 800
+
+
+def test_the_settings_can_be_given_back(export: Export, result: RunSummary) -> None:
+    words = ["refine", str(export.model), "--images", "i", "--config", str(result.output / "config.toml")]
+    again = cli.parse(words)
+    assert isinstance(again, Refine)
+    assert again.settings == command(export, result.output).settings
 
 
 def test_the_given_cloud_comes_along_with_the_cameras(export: Export, result: RunSummary) -> None:
@@ -201,9 +215,9 @@ def test_images_that_the_model_lacks_are_placed_when_that_is_wanted(export: Expo
     (tmp_path / "export/images.txt").write_text("".join(line for line in lines if line.split()[9] not in LACKING))
     shutil.copytree(export.images, tmp_path / "photos")
     Image.new("RGB", (320, 240), (128, 128, 128)).save(tmp_path / "photos/grey.png")
-    wanted = replace(
-        command(export, tmp_path / "out"), model=tmp_path / "export", images=tmp_path / "photos", complete=True
-    )
+    wanted = command(export, tmp_path / "out")
+    settings = replace(wanted.settings, refinement=TrackConfig(register_missing=True))
+    wanted = replace(wanted, model=tmp_path / "export", images=tmp_path / "photos", settings=settings)
     summary = refined(wanted)
     assert (summary.num_images, summary.num_registered) == (NUM_IMAGES + 1, NUM_IMAGES)
     assert summary.refinements[0].registered == LACKING
@@ -260,7 +274,13 @@ def test_photographs_without_a_feature_leave_the_model_as_it_was(export: Export,
     for name in sorted(export.truth)[:3]:
         Image.new("RGB", (320, 240), (128, 128, 128)).save(photos / name)
     shutil.copy(export.images / sorted(export.truth)[3], photos / "new.png")  # with features, and nothing to match
-    summary = refined(replace(command(export, tmp_path / "out"), images=photos, text=True, complete=True))
+    wanted = command(export, tmp_path / "out")
+    settings = replace(
+        wanted.settings,
+        output=ModelOutputConfig(text=True, trainer=False),
+        refinement=TrackConfig(register_missing=True),
+    )
+    summary = refined(replace(wanted, images=photos, settings=settings))
     assert summary.exit_code == 3
     assert [(one.name, one.reason) for one in summary.unregistered] == [
         ("new.png", "the model could not be refined, and images are placed by its tracks")
@@ -293,7 +313,12 @@ def test_names_with_blanks_are_refused_before_any_work_when_text_is_wanted(expor
     shutil.copytree(export.model, tmp_path / "export")
     lines = (tmp_path / "export/images.txt").read_text().replace("000.png", "00 0.png")
     (tmp_path / "export/images.txt").write_text(lines)
-    wanted = Refine(model=tmp_path / "export", images=tmp_path / "photos", output=tmp_path / "out", text=True)
+    wanted = Refine(
+        model=tmp_path / "export",
+        images=tmp_path / "photos",
+        output=tmp_path / "out",
+        settings=RefineConfig(output=ModelOutputConfig(text=True)),
+    )
     with pytest.raises(InputError, match=r"'00 0.png': COLMAP's text format cannot hold"):
         refined(wanted)
     assert not (tmp_path / "out/work/features").exists()
@@ -301,18 +326,24 @@ def test_names_with_blanks_are_refused_before_any_work_when_text_is_wanted(expor
 
 @pytest.mark.parametrize("tolerance", [0.0, -0.1, 0.3])
 def test_a_tolerance_that_means_nothing_is_refused(tolerance: float) -> None:
-    with pytest.raises(ConfigError, match=r"--pose-tolerance .* above 0 up to 0.2"):
-        Refine(model=Path("m"), images=Path("i"), output=Path("o"), pose_tolerance=tolerance)
+    with pytest.raises(ConfigError, match=rf"--pose-tolerance {tolerance}: must be above 0 and at most 0.2"):
+        RefineConfig(pose_tolerance=tolerance)
 
 
 def test_flags_reach_the_settings_of_the_run() -> None:
-    flags = "m --images i --output o --max-features 5 --track-neighbours 3 --text --trainer --workers 2 --seed 4"
-    flags += " --complete --masks somewhere"
-    config = tyro.cli(Refine, args=flags.split()).run_config()
-    assert (config.classical.max_features, config.refinement.track_neighbours) == (5, 3)
-    assert (config.output.text, config.output.trainer, config.output.dense) == (True, True, False)
-    assert (config.workers, config.seed) == (2, 4)
-    assert (config.refinement.complete, config.importing.masks) == (True, "somewhere")
+    flags = "refine m --images i --output o --max-features 5 --track-neighbours 3 --text --no-trainer --workers 2"
+    flags += " --seed 4 --register-missing --masks somewhere --trainer-scales 2 4 --camera-model OPENCV"
+    command = cli.parse(flags.split())
+    assert isinstance(command, Refine)
+    assert command.settings == RefineConfig(
+        masks=Path("somewhere"),
+        workers=2,
+        seed=4,
+        cameras=ModelCameraConfig(camera_model="OPENCV"),
+        output=ModelOutputConfig(text=True, trainer=False, trainer_scales=(2, 4)),
+        features=FeatureConfig(max_features=5),
+        refinement=TrackConfig(track_neighbours=3, register_missing=True),
+    )
 
 
 # ------------------------------------------------------------------------ the given cloud

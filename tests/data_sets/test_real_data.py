@@ -13,7 +13,14 @@ import pycolmap
 import pytest
 from helpers.independent_colmap_reader import read_binary
 
-from smust3r_colmap.config import ClassicalConfig, FusionConfig, OutputConfig, RunConfig, SegmentationConfig
+from smust3r_colmap.config import (
+    ClassicalConfig,
+    FeatureConfig,
+    FusionConfig,
+    OutputConfig,
+    RunConfig,
+    SegmentationConfig,
+)
 from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import Evaluation, compare_trajectories
 from smust3r_colmap.execution.progress import QuietReporter
@@ -24,7 +31,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.data]
 
 CONFIG = RunConfig(
     segmentation=SegmentationConfig(segment_length=8, overlap=4),
-    classical=ClassicalConfig(max_image_size=1024, max_features=2500, dense_size=256),
+    features=FeatureConfig(max_image_size=1024, max_features=2500),
+    classical=ClassicalConfig(dense_size=256),
     fusion=FusionConfig(max_points=100_000),
     output=OutputConfig(trainer=False, dense=False),
 )
@@ -87,7 +95,9 @@ def test_straight_forward_motion_registers_where_colmap_finds_no_start(
     folder = data_dir("kitti_a")
     names = sorted(path.name for path in (folder / "images").iterdir())[:12]
     config = replace(
-        CONFIG, classical=replace(CONFIG.classical, max_image_size=1226, max_features=2000, dense_size=160)
+        CONFIG,
+        features=FeatureConfig(max_image_size=1226, max_features=2000),
+        classical=ClassicalConfig(dense_size=160),
     )
     summary, found = run(folder, names, tmp_path, config)
     assert summary.num_registered == found.num_compared == 12
@@ -115,7 +125,8 @@ def test_the_loop_round_a_courtyard_is_found_and_closed(data_dir: Callable[[str]
     config = replace(
         CONFIG,
         segmentation=SegmentationConfig(segment_length=12, overlap=6),
-        classical=replace(CONFIG.classical, max_image_size=640, max_features=2000, dense_size=128),
+        features=FeatureConfig(max_image_size=640, max_features=2000),
+        classical=ClassicalConfig(dense_size=128),
         workers=1,
     )
     summary, found = run(folder, names, tmp_path, config)

@@ -15,6 +15,7 @@ from helpers.summaries import GOOD
 from PIL import Image
 
 from smust3r_colmap.cli.main import main, parse
+from smust3r_colmap.config import RunConfig
 from smust3r_colmap.storage.config_file import read_settings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -145,7 +146,8 @@ def test_the_settings_file_of_the_options_page_is_read(tmp_path: Path) -> None:
     found = re.search(r"```toml\n(.*?)```", text_of(ROOT / "docs/options.md"), re.S)
     assert found
     (tmp_path / "config.toml").write_text(found[1])
-    assert read_settings(tmp_path / "config.toml") == {"segment_length": 40, "overlap": 20, "camera_mode": "single"}
+    settings = read_settings(tmp_path / "config.toml", RunConfig)
+    assert settings == {"segment_length": 40, "overlap": 20, "camera_mode": "single"}
 
 
 def test_the_keys_of_the_summary_are_those_of_the_page() -> None:

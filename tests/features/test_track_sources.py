@@ -12,7 +12,7 @@ from helpers.runs import quiet_run
 from helpers.tracked_scenes import disturbed, stitched_scene
 from PIL import Image
 
-from smust3r_colmap.config import ClassicalConfig, ImportConfig, RefinementConfig, TrackSource
+from smust3r_colmap.config import CameraConfig, FeatureConfig, RefinementConfig, TrackSource
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import invert_rigid
@@ -60,7 +60,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Room:
 def refined(room: Room, output: Path, source: TrackSource) -> Refinement:
     posed = range(WITHOUT_POSE)
     with quiet_run(output) as run:
-        collection = collection_from_scan(scan_image_folder(room.images), ImportConfig())
+        collection = collection_from_scan(scan_image_folder(room.images), CameraConfig())
         scene = stitched_scene(collection, room.stitched, posed, {0: CAMERA})
         with run.folder.stage("stitched", key="a test").write() as folder:
             maps = DepthMapWriter(folder)
@@ -71,7 +71,7 @@ def refined(room: Room, output: Path, source: TrackSource) -> Refinement:
         initial = InitialScenes(
             scenes=(scene,), subsets=(tuple(posed),), maps=StoredDepthMaps(run.folder.work / "stitched")
         )
-        found = refine(run, initial, collection, None, RefinementConfig(tracks=source), ClassicalConfig())
+        found = refine(run, initial, collection, None, RefinementConfig(track_source=source), FeatureConfig())
     assert found is not None
     return found
 

@@ -25,7 +25,7 @@ from helpers.tracked_scenes import (
     true_matches,
     write_features,
 )
-from smust3r_colmap.config import ImportConfig
+from smust3r_colmap.config import CameraConfig
 from smust3r_colmap.exporters.finished_run import FinishedRun, write_finished
 from smust3r_colmap.exporters.registry import FORMATS, FormatSettings
 from smust3r_colmap.geometry.arrays import FloatArray
@@ -74,7 +74,7 @@ def make_finished_run(folder: Path) -> Example:
         scan = scan_image_folder(images)
         with run.stage("import", key=key_of("import")).write() as stage:
             RECORDS.write(stage, scan.records)
-        collection = collection_from_scan(scan, ImportConfig())
+        collection = collection_from_scan(scan, CameraConfig())
         figures = refine_corner(run, collection, world, placed=range(NUM_PLACED))
         finished = _store(run, collection, world, images)
         for name in ("sparse", "database", "ply", "dense"):

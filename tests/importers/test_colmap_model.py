@@ -420,7 +420,9 @@ def test_files_that_the_model_lacks_come_behind_its_images_with_the_camera_of_th
     model = external(["b.jpg", "c.jpg"], [intrinsics()], [0, 0])
     small = scanned("tele.jpg", size=(100, 80)).records
     scan = scanned("a.jpg", "b.jpg", "c.jpg")
-    fitted = fit_to_images(model, replace(scan, records=(*scan.records, *small)), complete=True, camera_model="RADIAL")
+    fitted = fit_to_images(
+        model, replace(scan, records=(*scan.records, *small)), register_missing=True, camera_model="RADIAL"
+    )
     assert names_of(fitted) == ["b.jpg", "c.jpg", "a.jpg", "tele.jpg"]
     assert [image.camera for image in fitted.collection.images] == [0, 0, 0, 1]
     guess = fitted.collection.cameras[1]
@@ -436,11 +438,11 @@ def test_a_guessed_camera_is_that_of_a_run_and_not_the_fisheye_of_the_model() ->
         for names, size in ((("a.jpg", "b.jpg"), (200, 100)), (("x.jpg", "y.jpg"), (160, 120)))
     ]
     scan = replace(scanned("a.jpg"), records=(*records[0], *records[1]))
-    fitted = fit_to_images(external(["a.jpg", "b.jpg"], [fisheye], [0, 0]), scan, complete=True)
+    fitted = fit_to_images(external(["a.jpg", "b.jpg"], [fisheye], [0, 0]), scan, register_missing=True)
     assert [camera.model for camera in fitted.collection.cameras] == ["OPENCV_FISHEYE", "SIMPLE_RADIAL"]
     assert any("1 cameras were guessed as SIMPLE_RADIAL, " in one and "for 2 images" in one for one in fitted.notes)
     plain = fit_to_images(
-        external(["a.jpg", "b.jpg"], [fisheye], [0, 0]), scanned("a.jpg", "b.jpg", "c.jpg"), complete=True
+        external(["a.jpg", "b.jpg"], [fisheye], [0, 0]), scanned("a.jpg", "b.jpg", "c.jpg"), register_missing=True
     )
     assert not any("guessed" in note for note in plain.notes)
 
@@ -448,7 +450,9 @@ def test_a_guessed_camera_is_that_of_a_run_and_not_the_fisheye_of_the_model() ->
 def test_no_camera_is_guessed_where_all_are_known() -> None:
     small = scanned("tele.jpg", size=(100, 80)).records
     scan = replace(scanned("a.jpg", "b.jpg", "c.jpg"), records=(*scanned("a.jpg", "b.jpg", "c.jpg").records, *small))
-    fitted = fit_to_images(external(["b.jpg", "c.jpg"], [intrinsics()], [0, 0]), scan, complete=True, calibrated=True)
+    fitted = fit_to_images(
+        external(["b.jpg", "c.jpg"], [intrinsics()], [0, 0]), scan, register_missing=True, calibrated=True
+    )
     assert names_of(fitted) == ["b.jpg", "c.jpg", "a.jpg"]
     (left_out,) = fitted.collection.rejected
     assert (left_out.name, left_out.reason) == ("tele.jpg", "no image of the model is of its size and camera")
@@ -457,7 +461,7 @@ def test_no_camera_is_guessed_where_all_are_known() -> None:
 def test_an_image_without_a_pose_in_the_model_is_placed_like_one_that_it_lacks() -> None:
     nameless = RejectedImage(name="a.jpg", reason="its pose in the model is not finite")
     model = replace(external(["b.jpg", "c.jpg"], [intrinsics()], [0, 0]), unposed=(nameless,))
-    fitted = fit_to_images(model, scanned("a.jpg", "b.jpg", "c.jpg"), complete=True)
+    fitted = fit_to_images(model, scanned("a.jpg", "b.jpg", "c.jpg"), register_missing=True)
     assert names_of(fitted) == ["b.jpg", "c.jpg", "a.jpg"]
     assert fitted.collection.rejected == ()
 
@@ -466,7 +470,7 @@ def test_an_image_without_a_pose_in_the_model_is_placed_like_one_that_it_lacks()
 def test_an_image_without_a_pose_that_is_placed_under_another_spelling_is_not_left_out_too(name: str) -> None:
     unposed = tuple(RejectedImage(name=one, reason="its pose is not finite") for one in (name, "gone.jpg"))
     model = replace(external(["b.jpg", "c.jpg"], [intrinsics()], [0, 0]), unposed=unposed)
-    fitted = fit_to_images(model, scanned("a.jpg", "b.jpg", "c.jpg"), complete=True)
+    fitted = fit_to_images(model, scanned("a.jpg", "b.jpg", "c.jpg"), register_missing=True)
     assert names_of(fitted) == ["b.jpg", "c.jpg", "a.jpg"]
     assert [one.name for one in fitted.collection.rejected] == ["gone.jpg"]
 
@@ -474,7 +478,7 @@ def test_an_image_without_a_pose_that_is_placed_under_another_spelling_is_not_le
 def test_each_file_is_that_of_one_image_without_a_pose() -> None:
     unposed = tuple(RejectedImage(name=one, reason="its pose is not finite") for one in ("l/a.jpg", "r/a.jpg"))
     model = replace(external(["b.jpg", "c.jpg"], [intrinsics()], [0, 0]), unposed=unposed)
-    fitted = fit_to_images(model, scanned("r/a.jpg", "b.jpg", "c.jpg"), complete=True)
+    fitted = fit_to_images(model, scanned("r/a.jpg", "b.jpg", "c.jpg"), register_missing=True)
     assert [one.name for one in fitted.collection.rejected] == ["l/a.jpg"]
 
 

@@ -21,7 +21,15 @@ from smust3r_colmap.backbones import masked_maps
 from smust3r_colmap.backbones.masked_maps import MaskedMaps
 from smust3r_colmap.cli.export import Export, run_export
 from smust3r_colmap.colmap.database import create_database
-from smust3r_colmap.config import ClassicalConfig, ImportConfig, LoopConfig, OutputConfig, RunConfig
+from smust3r_colmap.config import (
+    CameraConfig,
+    ClassicalConfig,
+    FeatureConfig,
+    LoopConfig,
+    OutputConfig,
+    RefineConfig,
+    RunConfig,
+)
 from smust3r_colmap.errors import ConfigError, ImageError, InputError, RunDirectoryError
 from smust3r_colmap.evaluation.readers import read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
@@ -33,7 +41,6 @@ from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.image_folder import import_image_folder
 from smust3r_colmap.importers.masks import load_mask, names_without_mask, with_masks
-from smust3r_colmap.importers.stage import CameraChoice
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.products import ImageCollection, ImageMask, SourceImage
 from smust3r_colmap.refine_model import refine_model
@@ -81,7 +88,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
 
 
 def collection_of(drive: Drive, masks: Path | None = None) -> ImageCollection:
-    collection = import_image_folder(drive.images, ImportConfig(camera_model="PINHOLE"))
+    collection = import_image_folder(drive.images, CameraConfig(camera_model="PINHOLE"))
     return collection if masks is None else with_masks(collection, masks)
 
 
@@ -173,14 +180,12 @@ def test_a_photograph_is_no_mask(drive: Drive, tmp_path: Path) -> None:
 
 
 def test_a_run_with_masks_among_the_images_ends_before_it_begins(drive: Drive, tmp_path: Path) -> None:
-    config = RunConfig(importing=ImportConfig(masks=str(drive.images)))
+    config = RunConfig(masks=drive.images)
     quiet, output = QuietReporter(sys.stderr), tmp_path / "out"
     with pytest.raises(ConfigError, match=r"--masks .*/images: lies inside the image folder"):
         reconstruct(drive.images, output, config, reporter=quiet)
     with pytest.raises(ConfigError, match=r"--masks .*/images: lies inside the image folder"):
-        refine_model(
-            tmp_path, drive.images, output, config, cameras=CameraChoice(), pose_tolerance=0.03, reporter=quiet
-        )
+        refine_model(tmp_path, drive.images, output, RefineConfig(masks=drive.images), reporter=quiet)
     assert not output.exists()
 
 
@@ -215,7 +220,7 @@ def test_the_key_of_the_features_knows_the_content_of_masks_and_stays_without(
     drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run_features, "extract_features", lambda *_, **__: ())
-    config = ClassicalConfig(max_image_size=100, max_features=10)
+    config = FeatureConfig(max_image_size=100, max_features=10)
 
     def key(collection: ImageCollection) -> str:
         first = replace(collection, images=collection.images[:1])
@@ -302,8 +307,9 @@ def test_a_mask_is_decoded_once_for_each_content_and_size(tmp_path: Path, monkey
 
 # ----------------------------------------------------------------------------- whole runs
 SETTINGS = RunConfig(
-    classical=ClassicalConfig(max_features=800, dense_size=96, depth_planes=16),
-    loop_closing=LoopConfig(loops=False),
+    features=FeatureConfig(max_features=800),
+    classical=ClassicalConfig(dense_size=96, depth_planes=16),
+    loop_closing=LoopConfig(loop_closure=False),
     output=OutputConfig(dense=False),
     workers=1,
 )
@@ -318,7 +324,7 @@ def masked_run(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> tuple[
     for path in sorted(drive.masks.iterdir())[:-1]:
         (masks / path.name).write_bytes(path.read_bytes())
     warnings = io.StringIO()
-    config = replace(SETTINGS, importing=ImportConfig(masks=str(masks)))
+    config = replace(SETTINGS, masks=masks)
     reconstruct(drive.images, output, config, reporter=QuietReporter(warnings))
     return output, warnings.getvalue()
 
@@ -355,7 +361,7 @@ def test_the_trainer_gets_the_masks_of_the_run_and_so_does_a_later_export(
     masked_run: tuple[Path, str], tmp_path: Path
 ) -> None:
     output, _ = masked_run
-    run_export(Export(run=output, format=("trainer",), output=tmp_path, quiet=True), QuietReporter(sys.stderr))
+    run_export(Export(run=output, format=("trainer",), output=tmp_path, quiet=True))
     for trainer in (output / "trainer", tmp_path / "trainer"):
         frames = json.loads((trainer / "transforms.json").read_text())["frames"]
         assert len(frames) == NUM_IMAGES
@@ -368,7 +374,7 @@ def test_the_trainer_gets_the_masks_of_the_run_and_so_does_a_later_export(
 
 
 def trainer_of(run: Path, output: Path, *, masks: Path | None = None) -> None:
-    run_export(Export(run=run, format=("trainer",), output=output, masks=masks, quiet=True), QuietReporter(sys.stderr))
+    run_export(Export(run=run, format=("trainer",), output=output, masks=masks, quiet=True))
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ Change = Callable[[Float32Array, Float32Array, Float32Array], Maps]
 
 NUM_IMAGES, HEIGHT, WIDTH = 60, 24, 32
 CONFIG = RunConfig(segmentation=SegmentationConfig(segment_length=16, overlap=8))
-WITHOUT_LOOPS = replace(CONFIG, loop_closing=replace(CONFIG.loop_closing, loops=False))
+WITHOUT_LOOPS = replace(CONFIG, loop_closing=replace(CONFIG.loop_closing, loop_closure=False))
 NETWORK = PRESETS["network"]
 SOUND_PERCENT = 1.0
 """Of the extent: the network's errors leave 0.2 to 0.4 on an unspoilt run."""

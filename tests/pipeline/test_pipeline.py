@@ -22,9 +22,10 @@ from smust3r_colmap.backbones.classical import backbone, calibration
 from smust3r_colmap.backbones.classical.mapping import METHOD_VERSION
 from smust3r_colmap.config import (
     AlignmentConfig,
+    CameraConfig,
     ClassicalConfig,
+    FeatureConfig,
     FusionConfig,
-    ImportConfig,
     LoopConfig,
     Must3rConfig,
     OutputConfig,
@@ -54,7 +55,8 @@ NUM_BRIEF = 12
 CONFIG = RunConfig(
     workers=1,
     segmentation=SegmentationConfig(segment_length=14, overlap=7),
-    classical=ClassicalConfig(max_features=1200, dense_size=160, depth_planes=32),
+    features=FeatureConfig(max_features=1200),
+    classical=ClassicalConfig(dense_size=160, depth_planes=32),
     fusion=FusionConfig(max_points=20_000),
     output=OutputConfig(text=True, trainer=False, dense=False),
 )
@@ -62,7 +64,7 @@ CONFIG = RunConfig(
 BRIEF = replace(CONFIG, segmentation=SegmentationConfig(segment_length=8, overlap=4))
 WITHOUT_TEXT = replace(CONFIG, output=OutputConfig(trainer=False, dense=False))
 UNREFINED = replace(CONFIG, refinement=RefinementConfig(refine=False))
-NO_LOOPS = LoopConfig(loops=False)
+NO_LOOPS = LoopConfig(loop_closure=False)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +76,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def finished(room: Path, tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
-    everything = replace(CONFIG, output=OutputConfig(text=True), workers=0)
+    everything = replace(CONFIG, output=OutputConfig(text=True), workers="auto")
     return run(room / "images", tmp_path_factory.mktemp("run") / "out", everything)
 
 
@@ -132,8 +134,8 @@ def test_the_focal_length_is_found_at_the_original_size(finished: RunSummary, ro
 
 def test_a_known_calibration_is_kept_to_the_last_digit(room: Path, brief_walk: Path, tmp_path: Path) -> None:
     params = (room / "intrinsics.txt").read_text().split("\n")[1].split()[2:]
-    known = ImportConfig(camera_model="PINHOLE", camera_params=",".join(params))
-    summary = run(brief_walk, tmp_path / "out", replace(BRIEF, importing=known, loop_closing=NO_LOOPS))
+    known = CameraConfig(camera_model="PINHOLE", camera_params=",".join(params))
+    summary = run(brief_walk, tmp_path / "out", replace(BRIEF, cameras=known, loop_closing=NO_LOOPS))
     (camera,) = pycolmap.Reconstruction(tmp_path / "out/sparse/0").cameras.values()
     assert (camera.model.name, [*camera.params]) == ("PINHOLE", [float(value) for value in params])
     poses = read_reference_sparse(tmp_path / "out/sparse/0")
@@ -367,8 +369,8 @@ def test_an_output_among_the_images_is_refused(room: Path) -> None:
     ("images", "changes", "match"),
     [
         ("photos", {}, "photos: there is no such folder"),
-        ("images", {"importing": ImportConfig(camera_model="PINHOLE", camera_params="1,2")}, "1,2"),
-        ("images", {"importing": ImportConfig(masks="nowhere")}, "nowhere: there is no such folder"),
+        ("images", {"cameras": CameraConfig(camera_model="PINHOLE", camera_params="1,2")}, "1,2"),
+        ("images", {"masks": Path("nowhere")}, "nowhere: there is no such folder"),
         ("images", {"backbone": "must3r", "must3r": Must3rConfig(weights="nowhere.pth")}, r"nowhere\.pth"),
     ],
 )
@@ -455,7 +457,7 @@ def test_a_walk_that_comes_back_is_closed_and_a_run_without_loops_is_not(
     assert before.shape == after.shape == (NUM_ROUND, 8)
     assert not np.allclose(before[:, 1:], after[:, 1:], atol=1e-6)
 
-    without = replace(ROUND, loop_closing=LoopConfig(loops=False), refinement=UNREFINED.refinement)
+    without = replace(ROUND, loop_closing=LoopConfig(loop_closure=False), refinement=UNREFINED.refinement)
     plain = run(round_trip / "images", tmp_path / "out", without)
     assert plain.loops == ()
     assert plain.graph is not None

@@ -40,7 +40,7 @@ from helpers.tracked_scenes import (
     wrong_matches,
 )
 
-from smust3r_colmap.config import ClassicalConfig, RefinementConfig
+from smust3r_colmap.config import FeatureConfig, RefinementConfig
 from smust3r_colmap.errors import ConfigError
 from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.features import stage as features_stage
@@ -659,7 +659,7 @@ class Start:
         initial = InitialScenes(scenes=self.scenes, subsets=(), surfaces=dict(enumerate(seen)) if with_surfaces else {})
         with quiet_run(self.output) as run:
             found = refine.refine(
-                run, initial, self.collection, self.features, options or RefinementConfig(), ClassicalConfig()
+                run, initial, self.collection, self.features, options or RefinementConfig(), FeatureConfig()
             )
         assert found is not None
         return found
@@ -788,7 +788,7 @@ def test_database_that_breaks_leaves_the_stitched_scenes_with_a_reason(start: St
 
 def test_tracks_of_pointmaps_need_maps(start: Start) -> None:
     with pytest.raises(ConfigError, match="--track-source pointmaps: the model has no depth maps; take features"):
-        start.refine(RefinementConfig(tracks="pointmaps"))
+        start.refine(RefinementConfig(track_source="pointmaps"))
 
 
 # -------------------------------------------------------------------------- surfaces

@@ -33,7 +33,7 @@ from helpers.tracked_scenes import (
     write_features,
 )
 
-from smust3r_colmap.config import ClassicalConfig, RefinementConfig
+from smust3r_colmap.config import FeatureConfig, RefinementConfig
 from smust3r_colmap.execution.task_pool import TaskFailure
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
@@ -404,6 +404,6 @@ def test_setting_of_the_run_reaches_the_task(
     initial = InitialScenes(scenes=one.scenes, subsets=(), surfaces={})
     with quiet_run(tmp_path / "out") as run:
         options = RefinementConfig(principal_point=wanted)
-        refine.refine(run, initial, one.collection, features, options, ClassicalConfig())
+        refine.refine(run, initial, one.collection, features, options, FeatureConfig())
     assert [each.principal_point for each in handed] == [wanted]
     assert RefinementConfig().principal_point, "the middle is left by default"

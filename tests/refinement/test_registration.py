@@ -10,7 +10,7 @@ import pytest
 from helpers.finished_runs import NUM_PLACED, Example, refine_corner
 from helpers.tracked_scenes import angle_deg, centres_of, poses_of
 
-from smust3r_colmap.config import ImportConfig
+from smust3r_colmap.config import CameraConfig
 from smust3r_colmap.execution.task_pool import TaskFailure
 from smust3r_colmap.importers.image_folder import collection_from_scan, scan_image_folder
 from smust3r_colmap.refinement import registration as completion_module
@@ -132,7 +132,7 @@ def test_the_refinement_stores_what_completion_added(
 ) -> None:
     """The refinement by itself would have placed the image; it is kept from it here."""
     monkeypatch.setattr(Bench, "register_missing", lambda *_: ())
-    collection = collection_from_scan(scan_image_folder(finished_example.images), ImportConfig())
+    collection = collection_from_scan(scan_image_folder(finished_example.images), CameraConfig())
     placed = [i for i in range(NUM_PLACED) if i != TAKEN_OUT or not added]
     with RunDirectory(tmp_path / "run") as run:
         figures = refine_corner(run, collection, finished_example.world, placed=placed, complete=True)

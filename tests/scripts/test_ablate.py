@@ -57,7 +57,7 @@ def test_every_question_changes_one_setting_and_has_the_default_among_its_answer
         for one in answers.values():
             changed = {
                 name
-                for section in ("segmentation", "alignment", "loop_closing", "classical", "fusion", "importing")
+                for section in ("segmentation", "alignment", "loop_closing", "classical", "fusion", "cameras")
                 for name, value in asdict(getattr(one.config, section)).items()
                 if value != asdict(getattr(BASE, section))[name]
             }

@@ -418,12 +418,12 @@ def test_ours_is_run_again_beside_what_colmap_left(finished: Path, monkeypatch: 
         return replace(cost(), exit_code=3)
 
     monkeypatch.setattr(compare, "run_child", record)
-    words = ["--reuse", "--rerun-ours", "--workers", "1", "2", "--flags=--no-dense --tracks both"]
+    words = ["--reuse", "--rerun-ours", "--workers", "1", "2", "--flags=--no-dense --track-source both"]
     results = run_script(finished, monkeypatch, *words, "--ours-name", "tried")
     assert [command[3] for command in commands] == ["reconstruct", "reconstruct"]
     for workers, command in zip("12", commands, strict=True):
         assert command[command.index("--workers") + 1] == workers
-        assert command[command.index("--tracks") + 1] == "both"
+        assert command[command.index("--track-source") + 1] == "both"
         assert Path(command[command.index("--output") + 1]).name == f"tried_workers{workers}"
     assert [result.workers for result in results.values()][:2] == [1, 2]
     assert [one.exit_code for result in results.values() for one in result.costs.values() if result.is_ours] == [0, 0]

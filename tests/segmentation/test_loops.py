@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -67,7 +68,7 @@ def plan(
     *,
     length: int = 60,
     overlap: int = 30,
-    similarity: float = 0.0,
+    similarity: float | Literal["auto"] = "auto",
     min_candidates: int = 3,
     min_distance: int = 3,
     half_width: int = 10,
@@ -176,8 +177,8 @@ def test_a_standing_camera_gives_nothing_and_says_so(noise: float) -> None:
     assert "the camera stood still" in found.note
 
 
-@pytest.mark.parametrize("similarity", [0.0, 0.5])
-def test_standing_for_a_while_is_not_coming_back(similarity: float) -> None:
+@pytest.mark.parametrize("similarity", ["auto", 0.5])
+def test_standing_for_a_while_is_not_coming_back(similarity: float | Literal["auto"]) -> None:
     places = np.concatenate([straight(100), np.full(250, 100.0), 101 + straight(150)])
     found = plan(see(places, noise=0.5), similarity=similarity)
     assert found.loops == ()
@@ -404,7 +405,7 @@ def test_descriptors_that_do_not_fit_the_collection_are_refused(shape: tuple[int
             np.zeros(shape, np.float32),
             ViewGraph.chain(100),
             plan_windows(ViewGraph.chain(100), segment_length=60, overlap=30),
-            similarity=0.0,
+            similarity="auto",
             min_candidates=3,
             min_distance=3,
             half_width=10,

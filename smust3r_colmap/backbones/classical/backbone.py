@@ -66,6 +66,7 @@ class ClassicalBackbone:
         config: settings of the backbone.
         run: where finished work is kept, and how tasks run.
         features: extracts those of the run that no earlier start has extracted.
+        exhaustive_below: windows of at most this many images are matched exhaustively.
         mapper: maps a segment, in a child process.
     """
 
@@ -80,10 +81,12 @@ class ClassicalBackbone:
         run: Run,
         *,
         features: Callable[[], RunFeatures],
+        exhaustive_below: int,
         mapper: Callable[[MappingTask], MappedSegment] = map_segment,
     ) -> None:
         self.collection = collection
         self.config = config
+        self.exhaustive_below = exhaustive_below
         self.run = run
         self._extract = features
         self._mapper = mapper
@@ -124,7 +127,7 @@ class ClassicalBackbone:
         if segment.kind == "loop":
             assert descriptors is not None, "loops are found by descriptors"
             return plan_loop_pairs(segment, descriptors, neighbours=neighbours)
-        return plan_pairs(segment, neighbours=neighbours, exhaustive_below=self.config.exhaustive_below)
+        return plan_pairs(segment, neighbours=neighbours, exhaustive_below=self.exhaustive_below)
 
     # --------------------------------------------------------------- every segment
     def _map(self, segments: Sequence[Segment], pairs: Mapping[int, tuple[Pair, ...]]) -> list[MappedSegment]:
@@ -369,8 +372,14 @@ def _read_matches(database: Path, pairs: Sequence[Pair]) -> InterSegmentMatches:
 
 def make_classical(context: BackboneContext, options: NoOptions) -> ClassicalBackbone:
     """The classical backbone of one run."""
-    run, collection, settings = context.run, context.collection, context.config.classical
-    return ClassicalBackbone(collection, settings, run, features=partial(features_of_run, run, collection, settings))
+    run, collection, sift = context.run, context.collection, context.config.features
+    return ClassicalBackbone(
+        collection,
+        context.config.classical,
+        run,
+        features=partial(features_of_run, run, collection, sift),
+        exhaustive_below=sift.exhaustive_below,
+    )
 
 
 CLASSICAL = BackbonePlugin(make=make_classical, options=NoOptions)

@@ -13,6 +13,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import nn
@@ -273,14 +274,14 @@ def _with_batches(plan: MemoryPlan, largest: int) -> MemoryPlan:
 
 
 # ------------------------------------------------------------------------------------ what is free
-def memory_budget(device: torch.device, wanted_gib: float) -> int:
+def memory_budget(device: torch.device, wanted_gib: float | Literal["auto"]) -> int:
     """Bytes that the network may take: what was asked for, or most of what is free where it runs.
 
     Args:
         device: where the network runs; its card must be usable.
-        wanted_gib: 0 for automatic.
+        wanted_gib: auto takes most of what is free.
     """
-    if wanted_gib > 0:
+    if wanted_gib != "auto":
         return int(wanted_gib * _GIB)
     if device.type == "cuda":
         return int(_SHARE_OF_FREE * torch.cuda.mem_get_info(device)[0])

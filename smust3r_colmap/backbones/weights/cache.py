@@ -49,11 +49,11 @@ def find_cached(file: OfficialFile) -> Path | None:
     return next((place for place in places if place.is_file()), None)
 
 
-def find_weights(given: str, network_size: int) -> Path:
+def find_weights(given: str | None, network_size: int) -> Path:
     """The network that a reconstruction takes: as told, else by SMUST3R_WEIGHTS, else from the cache.
 
     Args:
-        given: a path, or an official name that is in the cache; empty when nothing was told.
+        given: a path, or an official name that is in the cache; None when nothing was told.
         network_size: longer side of the images in the network, in pixels; the cache gives the network
             trained at 224 for sizes up to that, and one trained at 512 for larger ones.
 
@@ -61,7 +61,7 @@ def find_weights(given: str, network_size: int) -> Path:
         CheckpointError: what was told is not there, or nothing was told and the cache has none; the
             message has the ways to get one.
     """
-    if given:
+    if given is not None:
         return named_file(given, said_by="--weights", kind="network")
     from_environment = os.environ.get(WEIGHTS_VARIABLE)
     if from_environment:

@@ -40,6 +40,7 @@ def backbone_of(
         ImageCollection(images=images, cameras=(CAMERA,), calibrated=True),
         ClassicalConfig(),
         run,
+        exhaustive_below=25,
         features=lambda: features,
         mapper=mapper,
     )

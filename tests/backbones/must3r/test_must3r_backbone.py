@@ -32,7 +32,7 @@ from smust3r_colmap.backbones.must3r.checkpoint import write_safetensors_checkpo
 from smust3r_colmap.backbones.must3r.state_dicts import empty_parts
 from smust3r_colmap.backbones.options import NoOptions
 from smust3r_colmap.cli.main import main
-from smust3r_colmap.config import CameraFit, ImportConfig, KeyframeStrategy, Must3rConfig, RunConfig
+from smust3r_colmap.config import CameraConfig, CameraFit, KeyframeStrategy, Must3rConfig, RunConfig
 from smust3r_colmap.execution.progress import QuietReporter, StageTally
 from smust3r_colmap.importers.image_folder import import_image_folder
 from smust3r_colmap.products import Segment
@@ -50,7 +50,7 @@ TINY = Architecture(
         encoder_width=64, width=48, depth=2, num_heads=3, rope=ROPE, feedback="single_mlp", memory_mode="kv"
     ),
 )
-UNCALIBRATED = ImportConfig()
+UNCALIBRATED = CameraConfig()
 WEAK = 3
 WRONG_USE = 2
 
@@ -103,7 +103,7 @@ def predictor(room: Path, weights: Path, tmp_path: Path) -> Iterator[Callable[..
     """Makes predictors with other settings than the usual ones."""
     runs: list[RunDirectory] = []
 
-    def make(importing: ImportConfig = UNCALIBRATED, **settings: Any) -> Must3rPredictor:
+    def make(importing: CameraConfig = UNCALIBRATED, **settings: Any) -> Must3rPredictor:
         run = RunDirectory(tmp_path / f"run{len(runs)}")
         runs.append(run)
         config = RunConfig(must3r=Must3rConfig(weights=str(weights), network_size=64, **settings))
@@ -127,7 +127,7 @@ def stage_of(count: int) -> StageTally:
 
 # --------------------------------------------------------------------------- whole runs
 LOOPS = (
-    *("--segment-length", "4", "--overlap", "2", "--loop-half-width", "2"),
+    *("--segment-length", "4", "--overlap", "2", "--loop-window", "2"),
     *("--loop-similarity", "0.8", "--loop-min-candidates", "1", "--camera-fit", "upstream"),
 )
 
@@ -175,7 +175,7 @@ def test_every_image_is_encoded_once_though_segments_overlap(
     reconstruct(room, tmp_path / "out", weights, *LOOPS)
     assert len(encoded) == NUM_IMAGES
     encoded.clear()
-    reconstruct(room, tmp_path / "without_cache", weights, "--token-cache", "0", "--no-loops")
+    reconstruct(room, tmp_path / "without_cache", weights, "--token-cache", "0", "--no-loop-closure")
     assert len(encoded) > NUM_IMAGES, "keyframes are shown and predicted"
 
 
@@ -232,7 +232,7 @@ def test_images_of_one_camera_share_its_focal_length(predictor: Callable[..., Mu
 
 
 def test_a_calibration_is_kept(predictor: Callable[..., Must3rPredictor]) -> None:
-    known = ImportConfig(camera_model="PINHOLE", camera_params="101,102,63,47")
+    known = CameraConfig(camera_model="PINHOLE", camera_params="101,102,63,47")
     for image in predictor(known).predict(SEGMENT, stage_of(6)).images:
         assert image.intrinsics.params == (101, 102, 63, 47)
 

@@ -248,10 +248,10 @@ def test_a_system_that_says_nothing_gets_a_guess(tmp_path: Path) -> None:
 
 
 def test_the_budget_is_most_of_what_is_free_or_what_was_asked_for() -> None:
-    assert 0.5 * free_memory() < memory_budget(torch.device("cpu"), 0) < free_memory()
+    assert 0.5 * free_memory() < memory_budget(torch.device("cpu"), "auto") < free_memory()
     assert memory_budget(torch.device("cpu"), 1.5) == int(1.5 * GIB)
 
 
 def test_the_budget_on_a_card_is_of_its_own_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (10 * GIB, 24 * GIB))
-    assert 8 * GIB < memory_budget(torch.device("cuda"), 0) < 10 * GIB
+    assert 8 * GIB < memory_budget(torch.device("cuda"), "auto") < 10 * GIB

@@ -540,7 +540,7 @@ def test_the_cache_gives_the_network_for_the_size(
     for name in cached:
         _put(folder / name)
 
-    assert find_weights("", network_size) == folder / taken
+    assert find_weights(None, network_size) == folder / taken
 
 
 def test_the_flag_comes_before_the_variable_and_the_variable_before_the_cache(
@@ -551,9 +551,9 @@ def test_the_flag_comes_before_the_variable_and_the_variable_before_the_cache(
     monkeypatch.setenv("SMUST3R_WEIGHTS", str(variable))
 
     assert find_weights(str(flag), 512) == flag
-    assert find_weights("", 512) == variable
+    assert find_weights(None, 512) == variable
     monkeypatch.setenv("SMUST3R_WEIGHTS", "")
-    assert find_weights("", 512) == folder / "MUSt3R_512.pth"
+    assert find_weights(None, 512) == folder / "MUSt3R_512.pth"
 
 
 def test_an_official_name_is_looked_up_in_the_cache(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -561,7 +561,7 @@ def test_an_official_name_is_looked_up_in_the_cache(folder: Path, monkeypatch: p
     monkeypatch.setenv("SMUST3R_WEIGHTS", "MUSt3R_224_cvpr.pth")
 
     assert find_weights("MUSt3R_224_cvpr.pth", 512) == folder / "MUSt3R_224_cvpr.safetensors"
-    assert find_weights("", 512) == folder / "MUSt3R_224_cvpr.safetensors"
+    assert find_weights(None, 512) == folder / "MUSt3R_224_cvpr.safetensors"
 
 
 @pytest.mark.parametrize(
@@ -583,13 +583,13 @@ def test_a_variable_that_names_nothing_is_refused_under_its_name(folder: Path, m
     _put(folder / "MUSt3R_512.pth")
     monkeypatch.setenv("SMUST3R_WEIGHTS", "nowhere.pth")
     with pytest.raises(CheckpointError, match=r"^SMUST3R_WEIGHTS nowhere.pth: no such file"):
-        find_weights("", 512)
+        find_weights(None, 512)
 
 
 @pytest.mark.parametrize(("network_size", "name"), [(512, "MUSt3R_512.pth"), (224, "MUSt3R_224_cvpr.pth")])
 def test_without_weights_every_way_to_them_is_said(network_size: int, name: str) -> None:
     with pytest.raises(CheckpointError) as refusal:
-        find_weights("", network_size)
+        find_weights(None, network_size)
     for part in (f"weights fetch {name}`", "--weights FILE", "SMUST3R_WEIGHTS", "--backbone classical needs none"):
         assert part in str(refusal.value)
     assert "which is there" not in str(refusal.value)
@@ -598,7 +598,7 @@ def test_without_weights_every_way_to_them_is_said(network_size: int, name: str)
 def test_a_network_of_the_other_size_is_offered_not_taken(folder: Path) -> None:
     _put(folder / "MUSt3R_224_cvpr.pth")
     with pytest.raises(CheckpointError, match=r"`--weights MUSt3R_224_cvpr.pth`, which is there"):
-        find_weights("", 512)
+        find_weights(None, 512)
 
 
 def test_a_retrieval_head_is_found_as_such(folder: Path) -> None:
