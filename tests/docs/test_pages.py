@@ -97,16 +97,35 @@ def finished(finished_example: Example, tmp_path_factory: pytest.TempPathFactory
 CHEAP = sorted({command for _, command in COMMANDS if command.startswith(RUN_HERE) and "mesh" not in command})
 
 
+def shown_output(page: Path) -> dict[str, list[str]]:
+    """The lines of a session that follow each command."""
+    shown: dict[str, list[str]] = {}
+    for block in re.findall(r"```console\n(.*?)```", text_of(page), re.S):
+        command, *lines = block.splitlines()
+        shown[command.removeprefix("$ smust3r-colmap ")] = lines
+    return shown
+
+
+def without_numbers(line: str) -> str:
+    """Cut off where the page cuts it off."""
+    return re.sub(r"[\d.,]+", "#", line.removesuffix("..."))
+
+
 def test_cheap_commands_give_what_the_page_says(
     finished: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The training dataset first, for it is examined later."""
+    """The training dataset first, for it is examined later. What is printed is that of the README but for numbers."""
     monkeypatch.chdir(finished)
     assert len(CHEAP) >= 8
+    shown = shown_output(ROOT / "README.md")
+    assert len(shown.keys() & set(CHEAP)) >= 2
     for command in sorted(CHEAP, key=lambda one: not one.startswith("export")):
         words = shlex.split(command)
         distorted = words[:2] in (["validate", "out"], ["validate", "path/to/model"]) and "--readers" not in words
         assert main(words) == (3 if distorted else 0), (command, capsys.readouterr())  # as docs/validate.md says
+        printed = [without_numbers(line) for line in capsys.readouterr().out.splitlines()]
+        for line in map(without_numbers, shown.get(command, ())):
+            assert any(one.startswith(line) for one in printed), (command, line)
     assert (finished / "out/trainer/images_4").is_dir()
 
 
