@@ -22,10 +22,12 @@ import tyro
 from smust3r_colmap.cli.demo import Demo
 from smust3r_colmap.cli.doctor import Doctor
 from smust3r_colmap.cli.export import Export
+from smust3r_colmap.cli.presets import PRESETS
 from smust3r_colmap.cli.reconstruct import Reconstruct
 from smust3r_colmap.cli.refine import Refine
 from smust3r_colmap.cli.validate import Validate
 from smust3r_colmap.cli.weights import ConvertWeights, FetchWeights, ListWeights, PathOfWeights, VerifyWeights
+from smust3r_colmap.storage.config_file import flags_from_settings
 
 PAGE = Path(__file__).resolve().parents[1] / "docs/options.md"
 
@@ -60,6 +62,13 @@ segment_length = 40
 overlap = 20
 camera_mode = "single"
 ```
+
+## Presets
+
+`reconstruct --preset NAME` sets options that go together:
+
+| preset | the same as |
+|---|---|
 """
 
 
@@ -76,7 +85,13 @@ def main(words: Sequence[str] | None = None) -> int:
 
 def render_page() -> str:
     """The whole page."""
-    return "\n".join([INTRODUCTION, *(line for name, command in COMMANDS.items() for line in _command(name, command))])
+    commands = (line for name, command in COMMANDS.items() for line in _command(name, command))
+    return "\n".join([INTRODUCTION + "\n".join(map(_preset, PRESETS)), "", *commands])
+
+
+def _preset(name: str) -> str:
+    flags = " ".join(flags_from_settings(PRESETS[name])).replace("=", " ")
+    return _row((f"`{name}`", f"`{flags}`" if flags else "no options"))
 
 
 def _command(name: str, command: type) -> Iterator[str]:
