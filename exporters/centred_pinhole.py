@@ -1,9 +1,9 @@
-"""Pinhole cameras whose principal point is the middle of the image, and pixels carried into them.
+"""Pinhole cameras with the principal point in the middle of the image, and pixels resampled for them.
 
-Splat trainers read PINHOLE cameras only, and most of them ignore the principal point. COLMAP's undistortion
-keeps it where the calibration has it, so the view is cut to lie evenly round it. Both steps are one lookup:
-resampling twice would blur twice, and a cut by whole pixels would leave the point half a pixel off.
-The next module to read is ``training_selection``.
+Splat trainers read PINHOLE cameras only, and most of them ignore the principal point. COLMAP's undistortion keeps it
+where the calibration has it, so the view is cropped evenly round it. Both steps are one lookup: resampling twice would
+blur twice, and cropping by whole pixels would leave the point half a pixel off. The next module to read is
+``training_selection``.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _ROUNDING_PX = 1e-6
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CentredPinhole:
-    """A camera and the pinhole that stands for it.
+    """A camera and the pinhole that replaces it.
 
     Args:
         original: the camera of the image file.

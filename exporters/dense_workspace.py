@@ -4,17 +4,17 @@
     FOLDER/sparse/            the model of these images, PINHOLE
     FOLDER/stereo/depth_maps/NAME.geometric.bin      float32 z-depth in the unit of the model, 0 for none
     FOLDER/stereo/normal_maps/NAME.geometric.bin     unit vectors in the camera's axes, facing the camera
-    FOLDER/stereo/consistency_graphs/                empty; nobody reads it after patch match
+    FOLDER/stereo/consistency_graphs/                empty; only patch match reads it
     FOLDER/stereo/patch-match.cfg, fusion.cfg        all images; those that have a map
     FOLDER/fused.ply, fused.ply.vis                  by COLMAP's stereo fusion
 
-COLMAP's ``stereo_fusion``, its meshers and OpenMVS go on from here. A map starts with ``width&height&channels&``
+COLMAP's ``stereo_fusion``, its meshers and OpenMVS read it. A map starts with ``width&height&channels&``
 in ASCII, then float32 follows, row by row, one channel after the other. The value of row i and column j belongs to
 the centre of that pixel, which lies at (j + 0.5, i + 0.5) for the cameras of the model, and at (j, i) for OpenMVS,
 which moves the cameras when it reads them, and for COLMAP's fusion, which does not: see ``_fuse``.
 
 Images are as large as the maps, because readers compare the two: COLMAP resizes the camera to the map, others refuse
-maps of another size. What is to be trained or textured at full resolution starts from the training dataset.
+maps of another size. For training or texturing at full resolution use the training dataset.
 The next module to read is ``mesh``.
 """
 
@@ -76,7 +76,7 @@ pixels 87,000 points were left instead of 158,000, and their normals scattered b
 FUSED_NORMAL_ERROR_DEG = 30.0
 """COLMAP: 10, for normals that patch match optimises; ours are fitted to depth and noisier."""
 MAX_FUSED_NEIGHBOURS = 30
-"""Neighbours that a point is traced through (COLMAP: 50), which bounds memory and time on long sequences."""
+"""Neighbours that a point is traced through (COLMAP: 50), to bound memory and time on long sequences."""
 BYTES_PER_FUSED_PIXEL = 24
 """Depth, normal, colour and the mask of pixels used, in stereo fusion."""
 
@@ -111,14 +111,14 @@ def write_dense_workspace(
     memory_gib: float = 2.0,
     log_file: Path | None = None,
 ) -> DenseReport:
-    """Write the workspace into ``folder``, which is made, or replaced where an older workspace stands there.
+    """Write the workspace into ``folder``, which is made; an older workspace is replaced.
 
     Args:
         model: an adjusted model with real tracks, or its folder. Without tracks COLMAP knows no neighbours, and the
             fused cloud is empty.
         images: folder of the original images.
         maps: depth by the names of the model's images.
-        folder: written aside and renamed when complete.
+        folder: written atomically.
         memory_gib: maps that fusion holds in memory; larger workspaces are read submodel by submodel.
         log_file: for the messages of native code.
 
@@ -216,7 +216,7 @@ def _look_at(images: Path, model: pycolmap.Reconstruction, image_id: int) -> _So
 
 
 def _is_turned(data: bytes) -> bool:
-    """EXIF says that the pixels are stored turned or mirrored, which COLMAP does not look at."""
+    """EXIF says that the pixels are stored turned or mirrored. COLMAP ignores that."""
     with Image.open(io.BytesIO(data)) as head:
         return stored_orientation(head) != 1
 
@@ -346,7 +346,7 @@ def write_map(path: Path, values: FloatMap) -> None:
 def normals_of_depth(depth: FloatMap, img_from_cam: FloatArray) -> FloatMap:
     """Unit normals (H, W, 3) float32 in the camera's axes, facing the camera; zero where there is no depth.
 
-    The inverse depth of a plane n . x = 1 is n . ray, which is linear in the pixel's place: a x + b y + c. It is
+    The inverse depth of a plane n . x = 1 is n . ray, which is linear in the pixel coordinates: a x + b y + c. It is
     fitted by least squares to the pixels of the same surface in the window of ``NORMAL_RADIUS_PX`` round each pixel,
     and (a, b, c) = n img_from_cam^-1 gives n. Pixels with fewer than ``MIN_NORMAL_PIXELS`` such neighbours, or with
     all of them on a line, face the camera.
@@ -433,8 +433,8 @@ def _fuse(workspace: Path, written: list[_WrittenMap], memory_gib: float, log_fi
     """Write ``fused.ply`` and return the number of its points.
 
     COLMAP's fusion puts the centre of the first pixel at (0, 0) and takes the cameras as they are, with (0.5, 0.5):
-    its cloud is half a pixel beside the truth, which on small maps shows (5 cm at 30 m). So it is given cameras
-    moved by half a pixel, and the workspace keeps the true ones.
+    its cloud is off by half a pixel, which is visible on small maps (5 cm at 30 m). So fusion gets cameras moved by
+    half a pixel, and the workspace keeps the true ones.
     """
     needed = sum(one.num_pixels for one in written) * BYTES_PER_FUSED_PIXEL
     task = _FusionTask(
@@ -479,7 +479,7 @@ def _run_fusion(task: _FusionTask) -> int:
 
 
 def _in_child_or_raise(function: Callable[[TaskT], ResultT], task: TaskT, what: str, log_file: Path | None) -> ResultT:
-    """Run native code where it cannot take us along."""
+    """Run in a child process, so that a crash of native code stays there."""
     result = in_child(function, task, log_file=log_file)
     if isinstance(result, TaskFailure):
         raise ReconstructionError(f"{what} of the dense workspace failed: {result.reason}")

@@ -1,7 +1,7 @@
 """A finished run, opened again to write its results in other formats; nothing is computed anew.
 
-What a run stitched, refined and fused lies in its ``work`` folder; ``work/finished.json``, written when all stages
-stand, says which of it belongs together. The next module to read is ``exports``.
+The products of a run lie in its ``work`` folder. ``work/finished.json`` is written when all stages are done and says
+which of them belong together. The next module to read is ``registry``.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class FinishedRun:
 
 
 def write_finished(run: RunDirectory, finished: FinishedRun) -> None:
-    """Say that the run is complete, where its images are and which parts it has."""
+    """Record that the run is complete, where its images are and which parts it has."""
     masks = finished.masks
     parts = _Parts(
         format_version=FORMAT_VERSION,
@@ -94,13 +94,13 @@ def write_finished(run: RunDirectory, finished: FinishedRun) -> None:
 
 
 def begin_stages(run: Run, scan: FolderScan, *, overwrite: bool) -> None:
-    """To be called before the stages change: until the run ends again, they do not belong together.
+    """Call before the stages change: until the run ends again, they do not belong together.
 
-    And no earlier than the input is known to be of use, for until then the folder may hold a finished run.
+    Call it after the input was checked, because the folder may hold a finished run.
 
     Args:
         scan: of the image folder.
-        overwrite: throw away all that an earlier run left.
+        overwrite: delete all products of an earlier run.
     """
     if overwrite:
         run.folder.start_over(MODEL_FILES)
@@ -133,7 +133,7 @@ def open_finished(run: RunDirectory, *, images: Path | None = None, output: Path
     Args:
         run: held by this process, so that nobody changes it meanwhile; see ``check_is_finished``.
         images: the folder of the images, where it has moved since.
-        output: where results shall go instead of the run's folder.
+        output: where results go instead of the run's folder.
 
     Raises:
         RunDirectoryError: the run was made by another version.
@@ -166,7 +166,7 @@ def _read_parts(run: RunDirectory) -> _Parts:
 
 # -------------------------------------------------------------------- images and masks
 def check_images(run: RunDirectory, finished: FinishedRun) -> None:
-    """Refuse images that are not those the run was made of: their pixels would not fit its cameras.
+    """Refuse images other than those of the run: their pixels would not fit its cameras.
 
     A file of the same size that was touched since is compared by its content.
 
@@ -182,7 +182,7 @@ def check_images(run: RunDirectory, finished: FinishedRun) -> None:
 
 
 def check_masks_of_run(finished: FinishedRun) -> None:
-    """Refuse masks that are not those the run was made with, for formats that take them along.
+    """Refuse masks other than those of the run, for formats that contain them.
 
     Raises:
         InputError, ImageError: as ``check_masks``; the message names ``--masks``.

@@ -1,4 +1,4 @@
-"""File names that every trainer can read: no folders, one dot, no blanks, all stems different.
+"""File names that every trainer can read: no folders, one dot, no blanks, unique stems.
 
 The original line of 3D Gaussian Splatting takes a name up to its first dot for the key of an image, other
 readers stop at a blank or a comma, and Brush looks for the file whose path *ends* with the name, in any case.

@@ -1,9 +1,9 @@
 """Depth as 3D Gaussian Splatting's depth regulariser reads it: 16-bit inverse depth and one scale per image.
 
-The rule of its reader: ``value / 65536 * scale + offset`` is the inverse of z, in the unit of the model, and an
-image whose scale is not within 0.2 to 5 times the median of all is ignored. All images have one scale here. A
-value of 0 is *infinitely far* to the reader, which is right for the sky and wrong for a hole in a wall: small
-holes are closed. The next module to read is ``transforms_json``.
+The rule of its reader: ``value / 65536 * scale + offset`` is the inverse of z, in the unit of the model, and an image
+whose scale is not within 0.2 to 5 times the median of all is ignored. All images have one scale here. A value of 0 is
+*infinitely far* to the reader, which is right for the sky and wrong for a hole in a wall: small holes are filled. The
+next module to read is ``transforms_json``.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 """A mesh of a dense workspace, by Open3D, as PLY and as textured GLB.
 
-``poisson`` fits one closed surface to the fused cloud and cuts away what no points support: smooth, and holes in
-well-covered places are closed. ``tsdf`` averages the depth maps in a grid of voxels: only what was seen, with holes.
+``poisson`` fits one closed surface to the fused cloud and removes parts without points. It is smooth and closes holes
+in well-covered places. ``tsdf`` averages the depth maps in a grid of voxels. It has only what was seen, with holes.
 
 The PLY has a colour per vertex. The GLB has a real texture: every face takes its pixels from one undistorted image of
 the workspace, the one that sees it largest, and the images that are used are laid side by side in one texture. Nothing
-is blended, so that exposure changes show as seams, and there are no more pixels than the workspace's images have,
-which are as small as the depth maps. Faces that no image sees well enough keep their vertex colours.
+is blended, so exposure changes show as seams. The resolution is that of the workspace's images, which are as small as
+the depth maps. Faces that no image sees well enough keep their vertex colours.
 
 Open3D has a texture of its own (``compute_uvatlas``, then ``project_images_to_albedo``; both run on the CPU without a
 screen). It was tried on a scene of known colours, six images of 165 x 121 pixels and 115,000 faces, and not taken:
@@ -17,8 +17,8 @@ screen). It was tried on a scene of known colours, six images of 165 x 121 pixel
   0.7 and 1.3: it resamples and blends what is copied here.
 - It asks for a manifold mesh, and does not tell which faces no image sees.
 
-Open3D is imported here only, and in a child process: a machine without its system libraries loses the mesh and
-nothing else.
+Open3D is imported here only, and in a child process: a machine without its system libraries loses the mesh and nothing
+else.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ MIN_POINTS = 100
 """Fewer points of the cloud make no surface worth a file."""
 BULK_PERCENTILES = (1.0, 99.0)
 BULK_MARGIN_PER_EXTENT = 0.5
-"""Points beyond the percentiles by more than this part of the extent are left out: one stray point far away would
-take the resolution from everything else, because both methods divide the whole extent."""
+"""Points beyond the percentiles by more than this part of the extent are left out: both methods divide the whole
+extent, so one stray point far away would cost all resolution."""
 CELL_PER_SPACING = 2.0
 """Edge of the smallest octree cell over the usual distance of neighbouring points."""
 OCTREE_DEPTHS = (6, 10)
@@ -59,15 +59,15 @@ a thousand farther than eight point spacings from any point, three levels leave 
 VOXEL_PER_PIXEL = 1.5
 """Edge of a voxel over the width of a pixel at the median depth."""
 TRUNCATION_PER_DEPTH = 0.03
-"""Distance from the surface, over the median depth, up to which a depth map speaks: more than depth maps disagree."""
+"""Distance from the surface, over the median depth, up to which a depth map counts: more than depth maps disagree."""
 MAX_GRID_VOXELS = 1024
 """Voxels along the longest side of the bulk at most."""
 BLOCK_VOXELS, FIRST_BLOCKS = 8, 10_000
 """Voxels per side of the blocks in which space near surfaces is kept, and blocks to start with (100 MB); it grows."""
 MIN_MAPS = 2
-"""Depth maps that must have spoken about a voxel."""
+"""Depth maps that must cover a voxel."""
 MIN_COMPONENT_SHARE = 1e-3
-"""Connected parts with fewer faces than this part of all are specks."""
+"""Connected components with fewer faces than this share of all are removed."""
 
 MAX_TEXTURE_PX = 8192
 """Side of the texture; the largest that graphics hardware has in common."""
@@ -159,7 +159,7 @@ def write_mesh(workspace: Path, method: MeshMethod, *, log_file: Path | None = N
 def _make_mesh(task: _MeshTask) -> MeshReport | _NoOpen3D:
     """In the child process."""
     try:
-        import open3d  # noqa: PLC0415  (heavy, optional, and it may take the process along)
+        import open3d  # noqa: PLC0415  (heavy, optional, and it may crash the process)
     except ImportError as error:
         return _NoOpen3D(advice=advice_for(str(error)))
     views = list(_views(task.workspace))
@@ -336,7 +336,7 @@ def _tsdf(open3d: Any, workspace: Path, views: Sequence[_View]) -> _Mesh:
 
 
 def _voxel_size(views: Sequence[_View], box: tuple[FloatArray, FloatArray]) -> tuple[float, float]:
-    """Edge of a voxel and the distance from the surface up to which a map speaks, in the unit of the model."""
+    """Edge of a voxel and the distance from the surface up to which a map counts, in the unit of the model."""
     depths, pixels = [], []
     for view in views:
         depth = view.depth()
@@ -351,7 +351,7 @@ def _voxel_size(views: Sequence[_View], box: tuple[FloatArray, FloatArray]) -> t
 
 
 def _cleaned(open3d: Any, mesh: Any) -> _Mesh:
-    """Without specks, and without vertices that no face uses."""
+    """Without small components and unused vertices."""
     mesh.remove_degenerate_triangles()
     part_of_face, faces_of_part, _ = mesh.cluster_connected_triangles()
     faces_of_part = np.asarray(faces_of_part)

@@ -1,7 +1,7 @@
-"""Everything that a finished run can be written as, by name: what ``reconstruct`` writes and ``export`` writes again.
+"""All output formats of a finished run, by name, for ``reconstruct`` and ``export``.
 
-A format is a function from a finished run to files in its output folder; a new one is an entry of ``FORMATS``.
-The next module to read is the exporter of the format in ``exporters``.
+A format is a function from a finished run to files in its output folder; a new one is an entry of ``FORMATS``. The
+next module to read is the exporter of the format in ``exporters``.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _NAMES_SHOWN = 3
 
 @dataclass(frozen=True, kw_only=True)
 class FormatSettings:
-    """What the formats leave open; the names are those of ``config.OutputConfig``.
+    """Settings of the formats; the names are those of ``config.OutputConfig``.
 
     Args:
         text: models as .txt, too.
@@ -69,9 +69,9 @@ class Format:
     """One way to write a run.
 
     Args:
-        write: raises a ``SmustrError`` where this run cannot be written so.
+        write: raises a ``SmustrError`` if the run cannot be written in this format.
         result: the file or folder in the output folder that it makes or replaces.
-        about: a line for people.
+        about: one line of description.
         reads_images: the original images are needed.
         reads_masks: the masks of the run are needed, where it had any and no others are named.
     """
@@ -132,7 +132,7 @@ def export(
 def write_where_possible(
     finished: FinishedRun, names: Iterable[str], settings: FormatSettings, clock: StageClock
 ) -> Outputs:
-    """Write formats that take long, each a stage; one that cannot be written costs itself only."""
+    """Write slow formats, each as a stage; if one fails, the others are still written."""
     missing: list[MissingOutput] = []
     notes: list[str] = []
     for name in names:
@@ -163,7 +163,7 @@ def write_sparse(finished: FinishedRun, settings: FormatSettings) -> Written:
 
 
 def copy_model(model: Path, folder: Path, *, text: bool) -> None:
-    """The binary files of a model to where they belong, and if wanted text made of them."""
+    """Copy the binary files of a model, and write text files if wanted."""
     with atomic_folder(folder, may_hold=MODEL_FILES) as partial:
         for path in sorted(model.glob("*.bin")):
             shutil.copyfile(path, partial / path.name)
@@ -300,7 +300,7 @@ class Written:
 
     Args:
         name: the file or folder, below the output folder.
-        notes: what the user should know of it, such as what was left out.
+        notes: for the user, such as what was left out.
     """
 
     name: str
@@ -317,7 +317,7 @@ class MissingOutput:
 
 @dataclass(frozen=True, kw_only=True)
 class Outputs:
-    """What came of several formats: which could not be written, and the notes of the others."""
+    """The result of several formats: which could not be written, and the notes of the others."""
 
     missing: tuple[MissingOutput, ...]
     notes: tuple[str, ...]

@@ -1,5 +1,4 @@
-"""An adjusted model as a folder that splat and NeRF trainers read: 3DGS and its forks, gsplat, nerfstudio,
-instant-ngp, Brush.
+"""An adjusted model as a dataset for trainers: 3DGS and its forks, gsplat, nerfstudio, instant-ngp, Brush.
 
     images/               undistorted, PINHOLE, principal point in the middle, flat unique names
     images_2/ ...         smaller copies, where wanted
@@ -9,9 +8,9 @@ instant-ngp, Brush.
     transforms.json       the same cameras for nerfstudio and instant-ngp, with sparse_pc.ply
     names.json            original name: new name
 
-One camera has id 1. Every point has at least two views and every image at least one point; what was left out for
-that, or because it lies far from everything else, is counted. The folder is written aside and renamed.
-Next: ``transforms_json`` and ``inverse_depth`` say what two of the formats mean.
+If there is one camera, its id is 1. Every point has at least two views and every image at least one point. Cameras and
+points that were left out for that, or because they are far from all others, are counted. The folder is written
+atomically. Next: ``transforms_json`` and ``inverse_depth`` say what two of the formats mean.
 """
 
 from __future__ import annotations
@@ -71,7 +70,7 @@ class TrainingReport:
 
     Args:
         num_images, num_cameras, num_points, num_observations: in the folder.
-        num_copied: images that were right as they were, copied byte by byte.
+        num_copied: images copied byte by byte.
         num_renamed: images with a new name, see ``names.json``.
         left_out: of the model.
         images_without_depth: names in the model; their maps are black and 3DGS ignores them. Empty where

@@ -1,9 +1,9 @@
 """The pixels of a training dataset: undistorted images and masks, and smaller copies of them.
 
-A file that is as trainers want it already (a JPEG or PNG of a centred pinhole, 8-bit RGB, upright) is copied byte
-by byte; everything else is decoded, resampled once and encoded again. JPEG stays JPEG and all other formats become
-PNG. Grey images become RGB: gsplat and the original 3D Gaussian Splatting expect three channels.
-The next module to read is ``inverse_depth``.
+A file that trainers can use as it is (a JPEG or PNG of a centred pinhole, 8-bit RGB, upright) is copied byte by byte.
+All others are decoded, resampled once and encoded again. JPEG stays JPEG and all other formats become PNG. Grey images
+become RGB: gsplat and the original 3D Gaussian Splatting expect three channels. The next module to read is
+``inverse_depth``.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class TrainingImage:
     Args:
         source: the file; its size is the camera's.
         suffix: of the new file, ``.jpg`` or ``.png``.
-        camera: of the file, and the pinhole that stands for it.
+        camera: of the file, and the pinhole that replaces it.
         verbatim: the file is copied as it is.
     """
 

@@ -1,11 +1,10 @@
-"""Which images, points and observations of an adjusted model a trainer can use, and what has to stay behind.
+"""Which images, points and observations of an adjusted model a trainer can use, and which are left out.
 
-Trainers refuse or mislead themselves on: points seen once, images that see no point, points behind a camera, and
-cameras or points so far off that a reader which scales the scene to their extent sees nothing else.
-What is far is measured by the model's own yardstick, the usual distance of a point from the nearest camera
-that sees it (the median). On nine image sets mapped by COLMAP the neighbouring cameras of sound models lay at most
-2 such distances apart and points at most 25 away; cameras gone astray were 9 to 7000 off.
-The next module to read is ``training_dataset``.
+Trainers fail on, or are misled by, points seen once, images without points, points behind a camera, and cameras or
+points so far away that a reader that scales the scene to its extent sees nothing else. Distances are measured in
+median distances of a point from the nearest camera that sees it. On nine image sets mapped by COLMAP the neighbouring
+cameras of sound models lay at most 2 such distances apart and points at most 25 away; misplaced cameras were 9 to 7000
+away. The next module to read is ``training_dataset``.
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ from smust3r_colmap.exporters.centred_pinhole import CentredPinhole
 from smust3r_colmap.geometry.arrays import BoolArray, FloatArray, IntArray
 
 FAR_CAMERA_DISTANCES = 5.0
-"""Gap between a camera, or a group of them, and all others from which on it is left out, in usual distances. Cameras
-that see a common point are within the sum of their distances to it."""
+"""Gap between a camera, or a group of them, and all others from which on it is left out, in median point distances.
+Cameras that see a common point are within the sum of their distances to it."""
 FAR_POINT_DISTANCES = 30.0
-"""Distance of a point to the nearest camera that sees it from which on it is left out, in usual distances. COLMAP
-keeps points with 1.5 degrees of parallax: then the cameras are 30 / 38 of a usual distance apart."""
+"""Distance of a point to the nearest camera that sees it from which on it is left out, in median distances. COLMAP
+keeps points with 1.5 degrees of parallax: then the cameras are 30 / 38 of a median distance apart."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,7 +56,7 @@ class Observations:
 
 @dataclass(frozen=True, kw_only=True)
 class LeftOut:
-    """What stayed behind.
+    """What was left out.
 
     Args:
         far_images, unobserved_images: names in the model.
@@ -121,7 +120,7 @@ def select_for_training(
 
     far_camera: BoolArray = np.zeros(len(centres), np.bool_)
     if not keep_outliers:
-        usual = _usual_distance(centres, xyz, observations)
+        usual = _median_distance(centres, xyz, observations)
         far_camera = _far_from_the_others(centres, FAR_CAMERA_DISTANCES * usual)
         observations = observations.where(~far_camera[observations.image])
         far_point |= nearest_camera_distance(centres, xyz, observations) > FAR_POINT_DISTANCES * usual
@@ -213,7 +212,7 @@ def nearest_camera_distance(centres: FloatArray, xyz: FloatArray, observations: 
     return np.where(np.isfinite(nearest), nearest, 0.0)
 
 
-def _usual_distance(centres: FloatArray, xyz: FloatArray, observations: Observations) -> float:
+def _median_distance(centres: FloatArray, xyz: FloatArray, observations: Observations) -> float:
     """The median distance of the points of at least two views from their nearest camera; infinite without any."""
     seen_twice = _num_views(observations, len(xyz)) >= 2
     nearest = nearest_camera_distance(centres, xyz, observations)

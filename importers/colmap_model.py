@@ -1,9 +1,8 @@
-"""A COLMAP model that another program wrote, made usable as a start: cameras, poses, surface points.
+"""A COLMAP model that another program wrote, as initial cameras, poses and surface points.
 
-Other people's exports are read for what they mean; what had to be set right is told in words and counts.
-Two mistakes cannot be seen in the numbers: camera centres where translations belong, and rotations from
-camera to world. Whoever refines such a model finds hardly a match that agrees with it.
-The next module to read is ``fitted_model``, which joins the model with the image files.
+Known defects of exports are repaired and reported with counts. Two mistakes do not show in the numbers: camera centres
+in the place of translations, and rotations from camera to world. With them hardly a match agrees with the poses. The
+next module to read is ``fitted_model``, which joins the model with the image files.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ class SurfacePoints:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ExternalModel:
-    """A model from anybody, checked and repaired.
+    """A model of another program, checked, with known defects repaired.
 
     Args:
         folder: where its files lie.
@@ -64,7 +63,7 @@ class ExternalModel:
         cam_from_world: (N, 3, 4) rigid.
         surface: its points; images are positions in ``names``.
         unposed: images that are in the files but have no usable pose.
-        fixes: what was set right, one sentence each, with counts.
+        fixes: what was repaired, one sentence each, with counts.
     """
 
     folder: Path

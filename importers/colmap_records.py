@@ -1,10 +1,10 @@
-"""The files of anybody's COLMAP model, binary or text, as records that still know where they stood.
+"""The files of a COLMAP model by any program, binary or text, as records that know their place in the file.
 
-Read here and not by pycolmap, because pycolmap refuses, without naming a line, much of what other programs
-write: points whose tracks name images that do not exist, ``images.txt`` without its empty lines, a folder
-without points. What can only mean one thing is read and noted as a fix; the rest is refused with file,
-line and number. Observations (``points2D``) and the files of rigs and frames are passed over: poses in
-``images`` are complete without them, and whoever refines a model finds observations of his own.
+Read here and not by pycolmap, because pycolmap refuses, without naming a line, much of what other programs write:
+points whose tracks name images that do not exist, ``images.txt`` without its empty lines, a folder without points.
+Defects with only one meaning are repaired and counted; others are refused with file, line and number. Observations
+(``points2D``) and the files of rigs and frames are skipped: poses in ``images`` are complete without them, and
+refinement finds observations of its own.
 
 Layout: https://colmap.github.io/format.html. The next module to read is ``colmap_model``.
 """
@@ -89,7 +89,7 @@ class ModelRecords:
 
 
 class Fixes:
-    """Counts what was set right, and remembers where it happened first."""
+    """Counts repaired defects, and remembers the first place of each kind."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()

@@ -1,8 +1,8 @@
-"""A model from anybody, joined with the image files it was made of.
+"""An external model joined with its image files.
 
-Files are found by name, as far as that is beyond doubt. Cameras are brought to the size of the files, because
-many programs write them at the size of their network, and cameras that are the same within the scatter of a
-network become one. The next module to read is ``refine_command``.
+Files are found by name, where only one file fits. Cameras are scaled to the size of the files, because many programs
+write them at the size of their network. Cameras that are equal within the scatter of a network become one. The next
+module to read is ``stage``.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ SAME_FOCAL_TOLERANCE = 0.1
 scatter by a few percent, a zoom that was touched changes it by more."""
 
 MIN_SEEN_POINTS = 50
-"""Points that say which surface an image sees; with fewer the whole cloud says it better."""
+"""Points by which the surface seen by an image is known; with fewer the whole cloud is taken."""
 
 _NAMES_SHOWN = 5
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FittedModel:
-    """A external model whose images are files that can be read.
+    """An external model whose images are files that can be read.
 
     Args:
         collection: the images of the model, in natural order of their names, and behind them those of the folder
@@ -88,7 +88,7 @@ class FittedModel:
     def scene(self, origin: str) -> Scene:
         """As what a stitched run has before its refinement; ``origin`` says where it comes from.
 
-        A external model never says what its unit is, so the scene is not metric.
+        An external model never says what its unit is, so the scene is not metric.
         """
         images = self.collection.images[: self.num_posed]
         return Scene(
@@ -181,7 +181,7 @@ def fit_to_images(
 
 
 def _renumbered(surface: SurfacePoints, order: Sequence[int], num_before: int) -> SurfacePoints:
-    """Images by their index in the collection; what only images without a file had seen is seen by nobody."""
+    """Images by their index in the collection; observations by images without a file are dropped."""
     index_of = np.full(num_before, -1)
     index_of[list(order)] = np.arange(len(order))
     image = index_of[surface.image_of_observation]

@@ -1,9 +1,9 @@
 """A folder of photos or video frames, with its subfolders, as an ImageCollection.
 
-Two steps, so that a second start need not decode again: ``scan_image_folder`` reads every file once and
-keeps a record of each, ``collection_from_scan`` decides which images share a camera. Names in the model are
-the paths below the folder, exactly as they lie on the disk, so that COLMAP finds the files again; their
-order is natural (img2 before img10). A bad image is left out with a reason and never ends the run.
+Two steps, so that a second start decodes nothing again: ``scan_image_folder`` reads every file once and keeps a record
+of each; ``collection_from_scan`` decides which images share a camera. Names in the model are the paths below the
+folder, exactly as they lie on the disk, so that COLMAP finds the files again; their order is natural (img2 before
+img10). A bad image is left out with a reason and never ends the run.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def import_image_folder(
 
 
 def check_image_folder(folder: Path) -> None:
-    """Refuse what is no folder, before anything is made or changed for it.
+    """Refuse a path that is no folder, before anything is written.
 
     Raises:
         CollectionError: there is no such folder.

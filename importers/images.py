@@ -5,7 +5,7 @@ Whatever lies on disk (grey, palette, alpha, CMYK, 16 bit, turned by EXIF) comes
 - Alpha is dropped, as COLMAP does. Of files with several pages or frames the first is taken.
 - 16-bit data is scaled by the number of bits in use (8, 10, 12, 14 or 16, from the brightest pixel), so
   that 12-bit data in a 16-bit file does not come out black. There is no stretching beyond that.
-- Floating-point pixels are refused: their range is anybody's guess.
+- Floating-point pixels are refused, because their range is unknown.
 
 Pillow decodes 8 bits, because it refuses files that end early; OpenCV decodes 16 bits, of which Pillow
 keeps only the upper byte of colour images. Files are read into memory first: cv2 cannot open every path,
@@ -247,7 +247,7 @@ def _check_decodes(image: ImageFile, data: bytes) -> None:
 
 
 def _check_end(image: JpegImageFile, data: bytes) -> None:
-    """Refuse a JPEG whose rest was never written, but filled with zeros: they decode without complaint."""
+    """Refuse a JPEG whose rest was never written, but filled with zeros: they decode without an error."""
     end_of_image = b"\xff\xd9"
     pixels_start = image.fp.tell() if image.fp else 0  # The thumbnail in the header has an end of its own.
     if data.find(end_of_image, pixels_start) < 0:

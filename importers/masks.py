@@ -1,9 +1,9 @@
-"""Masks of images: which pixels no feature, no depth and no trainer shall use.
+"""Masks of images: pixels that features, depth and trainers do not use.
 
 Names are COLMAP's: the mask of an image is ``<name>.png`` below the folder of masks, else ``<name without
 suffix>.png``; what is black in it is left out, everything else is kept. An image without a mask is used as a whole
-(COLMAP's feature extraction passes over it). A mask has the size of the upright image, as its pixels are stored: what
-its own EXIF says of turning is not looked at. The next module to read is ``masked_maps``, which applies masks to depth.
+(COLMAP's feature extraction passes over it). A mask has the size of the upright image; its own EXIF orientation is
+ignored. The next module to read is ``masked_maps``, which applies masks to depth.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def masks_of(collection: ImageCollection, folder: Path | None) -> MaskSet | None
 
 
 def check_masks(masks: MaskSet, names: Iterable[str]) -> None:
-    """Refuse masks that are not those of the run: they would make another result of it without a word.
+    """Refuse masks other than those of the run: they would silently change the result.
 
     Args:
         names: of the images whose masks are needed.

@@ -1,4 +1,4 @@
-"""What a run starts from: the image folder, or the model of another program and its images.
+"""The input of a run: an image folder, or the model of another program and its images.
 
 Nothing in the run's folder changes here: until the input is known to be of use, it may hold a finished run. The next
 module to read is ``image_folder``.
@@ -40,7 +40,7 @@ def check_folders(images: Path, output: Path, masks: Path | None) -> None:
 
 
 def check_model_is_kept(model: Path, output: Path) -> None:
-    """Refuse to put results in the place of what they are made of.
+    """Refuse to overwrite the input with results.
 
     Raises:
         ConfigError: the model lies in the output folder, or is it.

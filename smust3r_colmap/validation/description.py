@@ -1,9 +1,8 @@
 """A COLMAP model and what lies around it, as plain values that every check can look at.
 
-Nothing here is trusted: ids may repeat, tracks may name images that do not exist, numbers may be NaN.
-That is why this is not a ``pycolmap.Reconstruction``, which refuses such models (or, worse, ends the
-process) before anybody could say what is wrong. Poses are ``cam_from_world`` as the files have them.
-The next module to read is ``binary_files``.
+Nothing here is trusted: ids may repeat, tracks may name images that do not exist, numbers may be NaN. That is why this
+is not a ``pycolmap.Reconstruction``, which refuses such models (or, worse, ends the process) before anything can be
+reported. Poses are ``cam_from_world`` as the files have them. The next module to read is ``binary_files``.
 """
 
 from __future__ import annotations
@@ -241,7 +240,7 @@ class ModelDescription:
         form: which of the two sets was read; binary where both are there, as COLMAP does.
         rigs, frames: None where the file is missing, as in models from before COLMAP 3.12.
         points: None where the file is missing.
-        defects: what the parser stumbled over.
+        defects: found by the parser.
         unread: files of cameras, images or points that hold something, of which not one record can be read.
     """
 

@@ -1,4 +1,4 @@
-"""Where a model and what belongs to it lie, whichever folder of a scene was named.
+"""Where a model and its files lie, whichever folder of the scene was named.
 
 Programs agree on SCENE/images and SCENE/sparse/0; COLMAP's dense workspace has SCENE/sparse. This is
 the only module of the package that knows names of folders. The next module to read is ``rules``.

@@ -1,8 +1,8 @@
-"""Every element of every track carried into its image: does it exist, how deep, how far off.
+"""Track elements projected into their images: whether they exist, their depth and their reprojection error.
 
-Points whose tracks name images or observations that do not exist stay in the arrays as NaN, so that the
-rules can count them. pycolmap projects (its camera models are the standard) one image at a time.
-The next module to read is ``rules``.
+Points whose tracks name images or observations that do not exist stay in the arrays as NaN, so that the rules can
+count them. pycolmap projects (its camera models are the standard) one image at a time. The next module to read is
+``rules``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _TABLE_FACTOR, _TABLE_LEAST = 20, 1000
 
 
 def project(model: ModelDescription) -> Projection:
-    """Carry the tracks of a model into its images; a million points with five views take some seconds."""
+    """Project the tracks of a model into its images; a million points with five views take some seconds."""
     images, points = model.images, model.points or _NO_POINTS
     image_index = index_of(images.ids, points.track_images)
     starts, num_rows = images.starts[:-1], images.num_rows

@@ -1,11 +1,10 @@
 """The programs that read COLMAP models, as data: which rule makes each of them stop or do worse.
 
-To add one, write a ``Reader`` into ``READERS``: ``refuses`` and ``warns`` map the name of a rule to what
-happens then. "Refuses" is for a program that stops, or that goes on with something wrong without a word;
-"warns" for one that works and gives less. Rules that are wrong by themselves (``Severity.REFUSED`` and
-worse) need not be named, nobody can use such a model. A rule that no program minds is no more than its
-own severity. Every entry was seen in a run of the program or read in its source, which ``evidence`` says.
-The next module to read is ``report``.
+To add one, write a ``Reader`` into ``READERS``: ``refuses`` and ``warns`` map the name of a rule to what happens then.
+"Refuses" is for a program that stops, or that goes on silently with wrong data; "warns" for one that works and gives
+less. Rules that are wrong by themselves (``Severity.REFUSED`` and worse) need not be named: no program can use such a
+model. A rule that affects no program has its own severity only. Every entry was seen in a run of the program or read
+in its source, which ``evidence`` says. The next module to read is ``report``.
 """
 
 from __future__ import annotations

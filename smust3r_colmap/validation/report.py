@@ -1,4 +1,4 @@
-"""What the rules found and what the readers make of it, as a value, as text and as JSON.
+"""The findings and their effect on each reader, as a value, as text and as JSON.
 
 Exit codes: 0 no reader that was asked for refuses the model, 1 it cannot be read to its end, 3 a reader
 refuses it. Warnings and notes do not change the code.
@@ -29,7 +29,7 @@ _NAMES_SHOWN = 4
 
 @dataclass(frozen=True, kw_only=True)
 class ReaderVerdict:
-    """What one reader makes of the model, and because of which rules."""
+    """Whether one reader can use the model, and the rules that decide it."""
 
     reader: Reader
     verdict: Verdict
@@ -113,10 +113,11 @@ class Report:
         )
 
 
-def judge(
+def assess(
     evidence: Mapping[str, Evidence], rules: Mapping[str, Rule], readers: Iterable[Reader]
 ) -> tuple[Finding, ...]:
-    """Findings with who minds, worst first and then in the order of the rules; facts nobody minds are left out."""
+    """Findings with the readers that they affect, worst first, then in the order of the rules; facts without effect are
+    left out."""
     readers = tuple(readers)
     findings = []
     for name, found in evidence.items():
@@ -132,7 +133,7 @@ def judge(
 
 
 def verdicts(findings: Sequence[Finding], readers: Iterable[Reader]) -> tuple[ReaderVerdict, ...]:
-    """What each reader makes of the findings."""
+    """The verdict for each reader."""
     return tuple(_verdict(findings, reader) for reader in readers)
 
 

@@ -1,9 +1,9 @@
 """Rules: each looks at a described model for one thing and says what it found.
 
 A rule is a function with a decorator; to add one, write it into the ``checks_*`` module where it belongs and into the
-tuple ``RULES`` at the end of that module. It knows nothing of programs: ``readers`` says who minds which rule. The
-functions are pure and get whatever is there, so that a check of the images must cope with having no image folder.
-The next module to read is ``checks_files``, then the others of that name.
+tuple ``RULES`` at the end of that module. It knows nothing of programs: ``readers`` says which rule affects which
+program. The functions are pure and get whatever is there, so that a check of the images must cope with having no image
+folder. The next module to read is ``checks_files``, then the others of that name.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from smust3r_colmap.validation.description import Subject
 class Severity(IntEnum):
     """How bad a finding is; a finding is at least as bad as what it does to the readers asked for.
 
-    FACT: nothing to say about it unless a reader minds.
-    NOTE: worth knowing, harms nobody.
+    FACT: not reported unless it affects a reader.
+    NOTE: harmless.
     WARNING: a reader gives a worse result, or the model itself is doubtful.
     REFUSED: a reader stops or silently goes wrong; for a rule that is so by itself, every reader does.
     BROKEN: a file cannot be read to its end, so nothing can be made of the model.
@@ -110,7 +110,7 @@ def measured(text: str) -> Evidence:
 
 
 def defects_as_evidence(subject: Subject, name: str) -> Evidence | None:
-    """What the parsers noted down for the rule ``name``; the number of lines has no "of"."""
+    """What the parsers found for the rule ``name``; the number of lines has no "of"."""
     found = [f"{defect.where}: {defect.text}" for defect in subject.model.defects if defect.rule == name]
     if not found:
         return None
@@ -120,7 +120,7 @@ def defects_as_evidence(subject: Subject, name: str) -> Evidence | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """A rule that found something, and who minds.
+    """A rule that found something, and the readers that it affects.
 
     Args:
         severity: the worst of the rule's own and of what the readers do.

@@ -57,7 +57,7 @@ def read_transforms(path: Path) -> TransformsFile:
 
 
 def _parsed(data: bytes) -> tuple[Any, bool]:
-    """The document, and whether it had to be freed of comments."""
+    """The document, and whether it had comments."""
     try:
         return json.loads(data), False
     except ValueError:

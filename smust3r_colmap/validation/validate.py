@@ -31,7 +31,7 @@ from smust3r_colmap.validation.description import Defect, ModelDescription, Subj
 from smust3r_colmap.validation.layout import Layout, UnreadableModelError, find_layout, model_files
 from smust3r_colmap.validation.projection import project
 from smust3r_colmap.validation.readers import READERS, Reader
-from smust3r_colmap.validation.report import Report, judge, measure, verdicts
+from smust3r_colmap.validation.report import Report, assess, measure, verdicts
 from smust3r_colmap.validation.rules import apply_rules, by_name
 from smust3r_colmap.validation.surroundings import (
     read_database,
@@ -84,7 +84,7 @@ def validate(
     layout = find_layout(named, images=images, database=database)
     subject = describe(layout, ask_colmap=ask_colmap)
     readers = tuple(readers)
-    findings = judge(apply_rules(subject, RULES.values()), RULES, readers)
+    findings = assess(apply_rules(subject, RULES.values()), RULES, readers)
     return Report(
         model=str(layout.model),
         figures=measure(subject),
@@ -217,7 +217,7 @@ def _load_with_pycolmap(folder: str) -> None:
 
 
 def _beside(layout: Layout, subject: Subject) -> dict[str, str]:
-    """What was looked at besides the model, for people who wonder why something was not found."""
+    """What was read besides the model, and why something was not."""
     found = {"images": "none found beside the model, so sizes and files were not checked; name them with --images"}
     if subject.images is not None:
         found["images"] = f"{layout.images} ({len(subject.images.files):,} files)"

@@ -10,7 +10,7 @@ from helpers.described_models import CX, CY, Edit, one_camera_per_image, unobser
 from smust3r_colmap.errors import ConfigError
 from smust3r_colmap.validation.description import Subject
 from smust3r_colmap.validation.readers import READERS, find_readers
-from smust3r_colmap.validation.report import judge, verdicts
+from smust3r_colmap.validation.report import assess, verdicts
 from smust3r_colmap.validation.rules import Severity, apply_rules
 from smust3r_colmap.validation.validate import RULES
 
@@ -18,7 +18,7 @@ READER_NAMES = [reader.name for reader in READERS]
 
 
 def verdicts_of(subject: Subject) -> dict[str, str]:
-    findings = judge(apply_rules(subject, RULES.values()), RULES, READERS)
+    findings = assess(apply_rules(subject, RULES.values()), RULES, READERS)
     return {verdict.reader.name: verdict.verdict for verdict in verdicts(findings, READERS)}
 
 
@@ -49,10 +49,10 @@ def test_a_reader_names_rules_that_exist_and_says_what_happens(reader: Any) -> N
 )
 def test_readers_judge_as_they_were_seen_to(bare: Subject, edit: Edit, refusing: set[str], warning: set[str]) -> None:
     """The scenes on which the programs themselves were run (OpenSplat and OpenMVS: by their source)."""
-    judged = verdicts_of(edit(bare))
+    found = verdicts_of(edit(bare))
 
-    assert {name for name, verdict in judged.items() if verdict == "refuses"} == refusing
-    assert {name for name, verdict in judged.items() if verdict == "warns"} == warning
+    assert {name for name, verdict in found.items() if verdict == "refuses"} == refusing
+    assert {name for name, verdict in found.items() if verdict == "warns"} == warning
 
 
 def test_what_is_wrong_by_itself_is_refused_by_everybody(bare: Subject) -> None:
@@ -62,10 +62,10 @@ def test_what_is_wrong_by_itself_is_refused_by_everybody(bare: Subject) -> None:
 def test_a_finding_is_as_bad_as_what_it_does_to_the_readers_asked_for(bare: Subject) -> None:
     evidence = apply_rules(with_names("left/a.png")(bare), RULES.values())
 
-    (finding,) = judge(evidence, RULES, find_readers(["3dgs-2023"]))
+    (finding,) = assess(evidence, RULES, find_readers(["3dgs-2023"]))
 
     assert (finding.rule.name, finding.severity) == ("name-subfolder", Severity.REFUSED)
-    assert judge(evidence, RULES, find_readers(["gsplat"])) == ()
+    assert assess(evidence, RULES, find_readers(["gsplat"])) == ()
 
 
 def test_an_unknown_reader_is_refused_with_the_known_ones() -> None:

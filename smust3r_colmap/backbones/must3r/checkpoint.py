@@ -2,7 +2,7 @@
 
 The official form is a file of ``torch.save`` with options, two state dicts and two strings that name the
 network (``restricted_pickle`` opens it, ``constructor_strings`` reads the strings). Our own is one safetensors
-file with the architecture in its header, which opens in no time and holds nothing that could be run. Both
+file with the architecture in its header, which opens at once and holds no code. Both
 are mapped into memory rather than read: the weights are there once, and pages come when they are used.
 Source: network specification, sections 2 and 15.
 """

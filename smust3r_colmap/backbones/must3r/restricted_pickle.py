@@ -1,9 +1,9 @@
-"""Files of ``torch.save`` opened without running anything that they ask for.
+"""Files of ``torch.save`` opened without running code from them.
 
 torch's own unpickler for weights knows tensors and plain containers, and refuses every other name. Files
 from a training loop hold more: their options, in an ``argparse.Namespace``, and members of classes that
 are not installed here. So the names are listed first, without loading; the namespace is allowed, and
-every other name becomes a stand-in that takes whatever it is given and does nothing with it. torch before
+every other name becomes a stand-in that accepts any arguments and does nothing. torch before
 2.10 has a hole in that unpickler (CVE-2026-24747).
 """
 
@@ -43,7 +43,7 @@ _SIGNS_OF_DAMAGE = (
 
 
 class StandIn:
-    """In the place of an object of a class that is not to be trusted or not there; it holds nothing."""
+    """Replaces an object of a class that is not trusted or not installed; it holds nothing."""
 
     def __new__(cls, *_arguments: object, **_keywords: object) -> StandIn:
         """Any arguments do."""

@@ -1,7 +1,7 @@
 """Where fetched weights lie, and which file a reconstruction takes.
 
-The folder is ``weights`` in what the environment variable SMUST3R_CACHE names, else in ``smust3r-colmap`` of the user's
-cache as ``platformdirs`` finds it. A network may lie there as published (``NAME.pth``), as converted
+The folder is ``weights`` in what the environment variable SMUST3R_CACHE names, else in ``smust3r-colmap`` of the
+user's cache as ``platformdirs`` finds it. A network may lie there as published (``NAME.pth``), as converted
 (``NAME.safetensors``), or both.
 """
 
@@ -39,7 +39,7 @@ def converted_place(file: OfficialFile) -> Path:
 
 
 def part_of(target: Path) -> Path:
-    """Where the bytes of a file lie that has not come whole."""
+    """Where an incomplete file lies."""
     return target.with_name(f"{target.name}.part")
 
 
@@ -50,15 +50,15 @@ def find_cached(file: OfficialFile) -> Path | None:
 
 
 def find_weights(given: str | None, network_size: int) -> Path:
-    """The network that a reconstruction takes: as told, else by SMUST3R_WEIGHTS, else from the cache.
+    """The network that a reconstruction takes: as given, else by SMUST3R_WEIGHTS, else from the cache.
 
     Args:
-        given: a path, or an official name that is in the cache; None when nothing was told.
+        given: a path, or an official name that is in the cache; None when nothing was given.
         network_size: longer side of the images in the network, in pixels; the cache gives the network
             trained at 224 for sizes up to that, and one trained at 512 for larger ones.
 
     Raises:
-        CheckpointError: what was told is not there, or nothing was told and the cache has none; the
+        CheckpointError: what was given is not there, or nothing was given and the cache has none; the
             message has the ways to get one.
     """
     if given is not None:
@@ -101,7 +101,7 @@ def named_file(named: str, *, said_by: str, kind: Kind) -> Path:
 
 
 def fetch_advice(file: OfficialFile) -> str:
-    """How to get the file, spelled out."""
+    """The command that fetches the file."""
     return f"fetch it with `smust3r-colmap weights fetch {file.name}`"
 
 

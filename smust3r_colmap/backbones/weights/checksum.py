@@ -1,4 +1,4 @@
-"""Whether a file is what the publisher put out."""
+"""Whether a file is as published."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ _BLOCK_BYTES = 2**20
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verdict:
-    """What the sum of a file says.
+class ChecksumResult:
+    """The result of comparing the sum of a file.
 
     Args:
         sound: the file is as published, and under its own name if the name is an official one.
@@ -25,7 +25,7 @@ class Verdict:
     text: str
 
 
-def verify(path: Path) -> Verdict:
+def verify(path: Path) -> ChecksumResult:
     """Compare the file with the published sums: with its own if its name is official, else with all.
 
     Raises:
@@ -35,15 +35,15 @@ def verify(path: Path) -> Verdict:
     wanted = find_official(path.name)
     if wanted is not None and found != wanted.md5:
         text = f"has MD5 {found}, published is {wanted.md5}: damaged or changed; delete it and fetch it again"
-        return Verdict(sound=False, text=f"{path}: {text}")
+        return ChecksumResult(sound=False, text=f"{path}: {text}")
     known = official_with_sum(found)
     if known is None:
-        return Verdict(sound=False, text=f"{path}: has MD5 {found}, which is none of the published sums")
-    return Verdict(sound=True, text=f"{path}: is {known.name} as published (MD5 {found})")
+        return ChecksumResult(sound=False, text=f"{path}: has MD5 {found}, which is none of the published sums")
+    return ChecksumResult(sound=True, text=f"{path}: is {known.name} as published (MD5 {found})")
 
 
 def md5_of(path: Path) -> str:
-    """The MD5 sum as 32 hexadecimal digits: it tells damage, it is no protection against forgery.
+    """The MD5 sum as 32 hexadecimal digits: it detects damage, not forgery.
 
     Raises:
         CheckpointError: the file cannot be read.

@@ -1,9 +1,9 @@
-"""Fetching one large file so that a broken connection costs none of the bytes that have come.
+"""Downloading one large file with resume: after a break only the missing bytes are requested.
 
 The bytes go to ``NAME.part``. Beside it ``NAME.part.json`` has the length of the whole file and what the server calls
-this version of it (an ETag or a date), so that the rest is asked for with Range and If-Range (RFC 9110, sections 13.1.5
-and 14.2): a server whose file has changed sends the new one whole, and so does one that cannot send a part. ``NAME``
-appears when all bytes are there and their sum is right.
+this version of it (an ETag or a date), so that the rest is asked for with Range and If-Range (RFC 9110, sections
+13.1.5 and 14.2): a server whose file has changed sends the new one whole, and so does one that cannot send a part.
+``NAME`` appears when all bytes are there and their sum is right.
 
 ``requests`` does the transfer and takes proxies from the environment. pooch would do the rest but for resuming: it
 begins a file anew after each break, which for 1.6 GiB is the point of this module.
@@ -49,8 +49,8 @@ def download(
         address: http or https.
         target: replaced if it exists; its folder is made.
         md5: sum that the whole file must have.
-        reporter: hears of progress in MiB, and of what goes wrong on the way.
-        timeout_s: without a sign from the server for this long, the connection counts as broken.
+        reporter: gets progress in MiB, and warnings.
+        timeout_s: after this long without data the connection counts as broken.
         pause_s: wait before a broken connection, if it brought anything, is tried again.
 
     Raises:
