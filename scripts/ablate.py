@@ -11,7 +11,7 @@
     weighting    (e) confidence weighting
 
 One setting is changed at a time; the others keep their defaults. A set is a folder, the name of one in
-$SMUST3R_DATA, or ``demo`` for the rendered room. With the oracle (the default) segments are simulated
+$SMUST3R_DATA, or ``demo`` for the rendered room. By default segments are simulated
 from a set with depth, and figures are means over seeds. With the classical backbone every configuration
 is a whole run; those of one segment length share a run directory, and so features and mapping.
 
@@ -61,9 +61,9 @@ from smust3r_colmap.stitching.camera_fusion import fuse_cameras
 from smust3r_colmap.stitching.resection import PlacedSubmodel, place_submodel
 from smust3r_colmap.stitching.spanning_tree import ChainedPart
 from smust3r_colmap.stitching.stitch import Stitching, stitch_submodels
-from smust3r_colmap.synthetic.backbone import OracleBackbone, oracle_maps
+from smust3r_colmap.synthetic.backbone import SimulatedBackbone, simulated_maps
 from smust3r_colmap.synthetic.room import write_demo
-from smust3r_colmap.synthetic.settings import PRESETS, REFERENCE_LENGTH, OracleSettings
+from smust3r_colmap.synthetic.settings import PRESETS, REFERENCE_LENGTH, SimulationSettings
 from smust3r_colmap.synthetic.truth import TrueScene, collection_of
 
 DriftOf = Literal["image", "segment"]
@@ -89,7 +89,7 @@ class Configuration:
 
 
 def questions(
-    base: RunConfig, *, num_images: int, lengths: Sequence[int], metric: bool, oracle: bool
+    base: RunConfig, *, num_images: int, lengths: Sequence[int], metric: bool, simulated: bool
 ) -> tuple[Configuration, ...]:
     """Every configuration of every question.
 
@@ -98,7 +98,7 @@ def questions(
         num_images: of the set; a longer segment than that cannot be cut.
         lengths: of segments, for the first question.
         metric: segments come in one unit, so that a rigid group makes sense.
-        oracle: false loops can be injected.
+        simulated: false loops can be injected.
     """
     return (
         *(
@@ -114,7 +114,7 @@ def questions(
             for group in get_args(TransformGroup)
             if _fits(group, metric)
         ),
-        *_loop_configurations(base, oracle=oracle),
+        *_loop_configurations(base, simulated=simulated),
         *(_changed("edges", base, alignment_edges=kind) for kind in reversed(get_args(AlignmentEdges))),
         *(_changed("weighting", _from_maps(base), confidence_weighting=way) for way in _weightings()),
     )
@@ -131,7 +131,7 @@ def _with_overlap(base: RunConfig, overlap: int) -> Configuration:
     return Configuration(question="overlaps", label=label, config=config)
 
 
-def _loop_configurations(base: RunConfig, *, oracle: bool) -> Iterator[Configuration]:
+def _loop_configurations(base: RunConfig, *, simulated: bool) -> Iterator[Configuration]:
     def with_loops(label: str, false_share: float = 0.0, **changes: bool | LoopKernel) -> Configuration:
         config = replace(base, loop_closing=replace(base.loop_closing, **changes))  # type: ignore[arg-type]
         return Configuration(question="loops", label=label, config=config, false_share=false_share)
@@ -139,7 +139,7 @@ def _loop_configurations(base: RunConfig, *, oracle: bool) -> Iterator[Configura
     yield with_loops("off", loop_closure=False)
     yield with_loops("on")
     yield with_loops("on, no kernel", loop_kernel="none")
-    if oracle:
+    if simulated:
         yield with_loops(f"on, {FALSE_SHARE:.0%} false", FALSE_SHARE)
         yield with_loops(f"on, {FALSE_SHARE:.0%} false, no kernel", FALSE_SHARE, loop_kernel="none")
 
@@ -176,7 +176,7 @@ class Outcome:
         placed: images in the largest model. models: connected parts.
         fallbacks: edges that are similarities though a wider group was asked for. edges: accepted ones.
         residual_px: median over the images of what rigid cameras leave (``resection``).
-        found, closed: loops that were tried, and believed. found_false, closed_false: of these, the
+        found, closed: loops that were tried, and accepted. found_false, closed_false: of these, the
             ones of places that only look alike.
         seconds: of CPU for alignment and graph, or of the clock for a whole run.
     """
@@ -286,19 +286,19 @@ def placed_submodels(
     )
 
 
-# -------------------------------------------------------------------------------- oracle
+# ----------------------------------------------------------------------------- simulated
 @dataclass(frozen=True, kw_only=True, eq=False)
-class OracleSet:
+class SimulatedSet:
     """A scene to simulate from.
 
     Args:
-        truth: the scene. errors: of the oracle, drift for a segment of ``REFERENCE_LENGTH`` images.
+        truth: the scene. errors: simulated, drift for a segment of ``REFERENCE_LENGTH`` images.
         drift_of: whether drift grows with every image (``"image"``), or is the same at the end of a segment
             of any length (``"segment"``), as with a network that sees the whole segment at once.
     """
 
     truth: TrueScene
-    errors: OracleSettings
+    errors: SimulationSettings
     drift_of: DriftOf = "image"
 
     def run(self, configuration: Configuration, seed: int) -> tuple[Outcome, Trajectories]:
@@ -312,13 +312,13 @@ class OracleSet:
         backbone = self._backbone(config, num_false)
         segments = plan_segments(backbone, config)
         result = backbone.reconstruct(segments.all, with_maps=range(len(segments.all)))
-        mislaid = {maps.submodel.segment for maps in oracle_maps(result) if maps.geometry.mislaid}
+        false_loops = {maps.submodel.segment for maps in simulated_maps(result) if maps.geometry.false_loop}
         started = time.process_time()
         solved = solve(result, segments, self.truth.names, config)
         seconds = time.process_time() - started
         truth = dict(zip(self.truth.names, self.truth.world_from_cam, strict=True))
         before, after = (compare_trajectories(one, truth) for one in (solved.before, solved.after))
-        false = [loop.segment.index in mislaid for loop in segments.loops.loops]
+        false = [loop.segment.index in false_loops for loop in segments.loops.loops]
         accepted = [decision.accepted for decision in solved.stitching.decisions]
         sound = [edge for edge in solved.edges.alignments if edge.accepted]
         outcome = Outcome(
@@ -358,15 +358,15 @@ class OracleSet:
         except ConfigError:
             return False
 
-    def _backbone(self, config: RunConfig, num_false: int) -> OracleBackbone:
+    def _backbone(self, config: RunConfig, num_false: int) -> SimulatedBackbone:
         errors = self.errors
         if self.drift_of == "segment":
             errors = with_drift_of_segments(errors, config.segmentation.segment_length)
         settings = replace(errors, false_loops=num_false)
-        return OracleBackbone(self.truth, collection_of(self.truth), settings, seed=config.seed)
+        return SimulatedBackbone(self.truth, collection_of(self.truth), settings, seed=config.seed)
 
 
-def with_drift_of_segments(errors: OracleSettings, length: int) -> OracleSettings:
+def with_drift_of_segments(errors: SimulationSettings, length: int) -> SimulationSettings:
     """The same errors, but a segment of this length drifts as one of ``REFERENCE_LENGTH`` would."""
     shorter = REFERENCE_LENGTH / length
     return replace(
@@ -379,7 +379,7 @@ def with_drift_of_segments(errors: OracleSettings, length: int) -> OracleSetting
     )
 
 
-def plan_segments(backbone: OracleBackbone, config: RunConfig) -> Segments:
+def plan_segments(backbone: SimulatedBackbone, config: RunConfig) -> Segments:
     """Windows, and the loops between them."""
     graph = ViewGraph.chain(len(backbone.collection))
     windows = plan_windows(
@@ -571,23 +571,21 @@ def parse_arguments() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sets", nargs="+", metavar="SET", help="a folder, its name in $SMUST3R_DATA, or demo")
-    parser.add_argument("--backbone", choices=["oracle", "classical"], default="oracle")
-    parser.add_argument(
-        "--preset", choices=sorted(PRESETS), default="network", help="errors of the oracle (%(default)s)"
-    )
+    parser.add_argument("--backbone", choices=["simulated", "classical"], default="simulated")
+    parser.add_argument("--preset", choices=sorted(PRESETS), default="network", help="simulated errors (%(default)s)")
     parser.add_argument(
         "--drift-of",
         choices=get_args(DriftOf),
         default="image",
-        help="the oracle's drift grows with every image, or is the same in every segment (%(default)s)",
+        help="the simulated drift grows with every image, or is the same in every segment (%(default)s)",
     )
-    parser.add_argument("--seeds", type=int, default=3, help="runs per configuration of the oracle (%(default)s)")
+    parser.add_argument("--seeds", type=int, default=3, help="simulated runs per configuration (%(default)s)")
     parser.add_argument("--only", nargs="+", choices=QUESTIONS, help="these questions; all by default")
     parser.add_argument("--segment-length", type=int, default=60, help="where it is not asked about (%(default)s)")
     parser.add_argument("--lengths", type=int, nargs="+", default=LENGTHS, help="that are asked about (the paper's)")
     parser.add_argument("--all-images", action="store_true", help=f"use all images where there is a {SUBSET_FILE}")
     # An alignment takes a few thousand of a segment's pixels anyway.
-    parser.add_argument("--map-size", type=int, default=96, help="of the oracle's maps in pixels (%(default)s)")
+    parser.add_argument("--map-size", type=int, default=96, help="of the simulated maps in pixels (%(default)s)")
     parser.add_argument("--demo-images", type=int, default=300, help="of the rendered room (%(default)s)")
     parser.add_argument("--work", type=Path, default=Path("ablation_out"), help="for whole runs (%(default)s)")
     parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw the trajectories of the first seed there")
@@ -601,7 +599,7 @@ def describe_runs(arguments: argparse.Namespace) -> str:
     by_default = f"l = {length}, p = {length // 2} where nothing else is said"
     if arguments.backbone == "classical":
         return f"classical backbone, {by_default}"
-    errors = f"oracle '{arguments.preset}' with drift of each {arguments.drift_of}"
+    errors = f"simulated '{arguments.preset}' with drift of each {arguments.drift_of}"
     return f"{errors}, mean of {arguments.seeds} seeds, {by_default}"
 
 
@@ -617,7 +615,7 @@ def open_set(name: str, arguments: argparse.Namespace) -> AblatedSet:
         names = subset.read_text(encoding="utf-8").split() if subset.exists() and not arguments.all_images else None
         truth = TrueScene.from_rgbd_folder(folder, names, max_size=arguments.map_size)
     seeds = tuple(range(arguments.seeds))
-    opened = OracleSet(truth=truth, errors=PRESETS[arguments.preset], drift_of=arguments.drift_of)
+    opened = SimulatedSet(truth=truth, errors=PRESETS[arguments.preset], drift_of=arguments.drift_of)
     return AblatedSet(
         name=Path(name).name, unit="m", num_images=len(truth), metric=truth.metric, seeds=seeds, run=opened.run
     )
@@ -642,7 +640,7 @@ def asked(one: AblatedSet, arguments: argparse.Namespace) -> tuple[Configuration
         num_images=one.num_images,
         lengths=arguments.lengths,
         metric=one.metric,
-        oracle=arguments.backbone == "oracle",
+        simulated=arguments.backbone == "simulated",
     )
 
 

@@ -1,11 +1,11 @@
-"""The oracle: every segment as a network would give it, from a scene that is known exactly.
+"""A simulated backbone: every segment as a network would give it, from a scene with ground truth.
 
     truth = TrueScene.from_demo(200, 72, 96)
-    backbone = OracleBackbone(truth, collection_of(truth), PRESETS["network"], seed=0)
+    backbone = SimulatedBackbone(truth, collection_of(truth), PRESETS["network"], seed=0)
     result = backbone.reconstruct(plan_windows(ViewGraph.chain(200), segment_length=60, overlap=30), with_maps=range(6))
 
-Everything stays in memory; maps are made when they are read. A segment comes out the same whatever
-else is asked for: its errors depend on the seed, its images and its kind alone.
+Everything stays in memory; maps are made when they are read. The errors of a segment depend on the seed, its images and
+its kind alone. The next module to read is ``truth``.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ from smust3r_colmap.synthetic.distortion import (
     warped_cameras,
     warped_points,
 )
-from smust3r_colmap.synthetic.settings import OracleSettings
+from smust3r_colmap.synthetic.settings import SimulationSettings
 from smust3r_colmap.synthetic.truth import TrueScene
 
 _FALSE_LOOPS, _DESCRIPTORS, _CHAIN, _SEGMENT, _IMAGE = range(5)
@@ -76,14 +76,14 @@ class SimulatedGeometry:
         warp: (4, 4) of the segment frame, the identity where none was asked for.
         focal_factor: estimated over true focal length.
         smooth: (N, M) coefficients of the smooth depth error.
-        mislaid: the two halves of this loop segment were laid onto each other although they share nothing.
+        false_loop: the two halves of this loop segment are placed on each other although they have nothing in common.
     """
 
     seg_from_world: FloatArray
     warp: FloatArray
     focal_factor: float
     smooth: FloatArray
-    mislaid: bool
+    false_loop: bool
 
     @property
     def is_warped(self) -> bool:
@@ -91,7 +91,7 @@ class SimulatedGeometry:
         return not np.array_equal(self.warp, np.eye(4))
 
 
-class OracleMaps:
+class SimulatedMaps:
     """``DenseMaps`` of one submodel, made when they are read; only the last image is kept.
 
     Args:
@@ -107,7 +107,7 @@ class OracleMaps:
         truth: TrueScene,
         submodel: Submodel,
         geometry: SimulatedGeometry,
-        settings: OracleSettings,
+        settings: SimulationSettings,
         seed_words: Sequence[int],
     ) -> None:
         self.submodel, self.geometry = submodel, geometry
@@ -188,7 +188,7 @@ class _SimulatedMaps:
     confidence: Float32Array
 
 
-class OracleBackbone:
+class SimulatedBackbone:
     """``Backbone`` that knows the truth and disturbs it by stated amounts.
 
     A segment gives one submodel. A window comes out right up to its errors, and so does a loop segment
@@ -207,10 +207,12 @@ class OracleBackbone:
         CollectionError: the collection has other images than the truth.
     """
 
-    name = "oracle"
+    name = "simulated"
     has_tracks = False
 
-    def __init__(self, truth: TrueScene, collection: ImageCollection, settings: OracleSettings, seed: int = 0) -> None:
+    def __init__(
+        self, truth: TrueScene, collection: ImageCollection, settings: SimulationSettings, seed: int = 0
+    ) -> None:
         names = tuple(image.name for image in collection.images)
         if names != truth.names:
             first = next((pair for pair in zip(names, truth.names, strict=False) if pair[0] != pair[1]), None)
@@ -230,7 +232,7 @@ class OracleBackbone:
         return BackboneResult(
             reconstructions=tuple(reconstruction for reconstruction, _ in made),
             dense=tuple(maps for _, maps in made if maps is not None),
-            dense_key=key_of("oracle", self.truth.digest, self.settings, self.seed, segments),
+            dense_key=key_of("simulated", self.truth.digest, self.settings, self.seed, segments),
             matches=None,
             rejected=(),
         )
@@ -256,7 +258,7 @@ class OracleBackbone:
         return with_noise(made_alike(honest, self.false_loops), self.settings.descriptor_noise, rng)
 
     # ------------------------------------------------------------------------- one segment
-    def _segment(self, segment: Segment) -> tuple[SegmentReconstruction, OracleMaps | None]:
+    def _segment(self, segment: Segment) -> tuple[SegmentReconstruction, SimulatedMaps | None]:
         seed_words = self._seed_words(segment)
         rng = np.random.default_rng((*seed_words, _SEGMENT))
         fails = rng.random() < self.settings.failed_share
@@ -270,13 +272,13 @@ class OracleBackbone:
             segment=segment.index,
             submodels=(submodel,),
             unregistered=tuple(
-                UnregisteredImage(image=image, reason="the oracle was told to drop images")
+                UnregisteredImage(image=image, reason="the simulation drops images")
                 for image in sorted(set(segment.images) - set(images))
             ),
             attempts=(submodel.method,),
             metric=self.metric,
         )
-        return reconstruction, OracleMaps(self.truth, submodel, geometry, self.settings, seed_words)
+        return reconstruction, SimulatedMaps(self.truth, submodel, geometry, self.settings, seed_words)
 
     def _seed_words(self, segment: Segment) -> tuple[int, ...]:
         """What the random numbers of a segment start from: the seed, its images and its kind, not its index."""
@@ -284,7 +286,7 @@ class OracleBackbone:
         return self.seed, int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
 
     def _nothing(self, segment: Segment) -> SegmentReconstruction:
-        reason = "the oracle was told to fail segments"
+        reason = "the simulation fails segments"
         return SegmentReconstruction(
             segment=segment.index,
             submodels=(),
@@ -302,11 +304,11 @@ class OracleBackbone:
         smooth = smooth_coefficients(len(images), settings.depth_distortion, rng)
 
         cameras = self.truth.world_from_cam[list(images)]
-        believed, mislaid = self._believed_cameras(segment, images, cameras)
+        confused, false_loop = self._confused_cameras(segment, images, cameras)
         seg_from_first = gauge if settings.gauge == "random" else np.eye(4)
         seg_from_first[:3, :3] *= scale
         in_common = chain_steps(cameras, settings, np.random.default_rng((self.seed, _CHAIN)))
-        seg_from_cam = bent_path(believed, in_common @ own, seg_from_first)
+        seg_from_cam = bent_path(confused, in_common @ own, seg_from_first)
 
         warp = np.eye(4)
         if settings.warp > 0:
@@ -322,7 +324,7 @@ class OracleBackbone:
             warp=warp,
             focal_factor=focal_factor,
             smooth=smooth,
-            mislaid=mislaid,
+            false_loop=false_loop,
         )
 
     def _submodel(self, segment: Segment, images: tuple[int, ...], geometry: SimulatedGeometry) -> Submodel:
@@ -339,16 +341,16 @@ class OracleBackbone:
             images=images,
             seg_from_cam=seg_from_cam,
             intrinsics=tuple(estimated[size] for size in sizes),
-            method="oracle",
+            method="simulated",
             reprojection_error_px=float("nan"),
             tracks=None,
         )
 
     # ------------------------------------------------------------------------- loop segments
-    def _believed_cameras(
+    def _confused_cameras(
         self, segment: Segment, images: tuple[int, ...], cameras: FloatArray
     ) -> tuple[FloatArray, bool]:
-        """(N, 3, 4) where a network would take the cameras to be, and whether that is a mistake."""
+        """(N, 3, 4) cameras of a network that may confuse two similar places, and whether it does."""
         split = _largest_gap(images) if segment.kind == "loop" else None
         pair = taken_for_each_other(images[:split], images[split:], self.overlap, self.false_loops) if split else None
         if pair is None:
@@ -361,10 +363,10 @@ class OracleBackbone:
 def taken_for_each_other(
     first: Sequence[int], second: Sequence[int], overlap: FloatArray, false_loops: Sequence[FalseLoop]
 ) -> tuple[int, int] | None:
-    """Images of the two halves of a loop segment that a network takes for one view by mistake, or None.
+    """Images of the two halves of a loop segment that a network confuses, or None.
 
-    It goes by what most pairs of images say: the sum over all pairs of the overlap they have, against
-    that which they seem to have. Halves that say nothing at all are laid on each other by their middles.
+    It does if the apparent overlap, summed over all pairs of images, is larger than the true one. Halves without any
+    overlap are placed on each other by their middle images.
     """
     common = overlap[np.ix_(first, second)]
     seen = float(common[common > NO_OVERLAP].sum())
@@ -415,23 +417,23 @@ class TrueRelation:
     spread_position: float
 
 
-def oracle_maps(result: BackboneResult) -> tuple[OracleMaps, ...]:
-    """The maps of all submodels of a result of the oracle, with the errors that were made.
+def simulated_maps(result: BackboneResult) -> tuple[SimulatedMaps, ...]:
+    """The maps of all submodels of a simulated result, with the simulated errors.
 
     Raises:
         TypeError: another backbone made it.
     """
-    maps = tuple(one for one in result.dense if isinstance(one, OracleMaps))
+    maps = tuple(one for one in result.dense if isinstance(one, SimulatedMaps))
     if len(maps) < len(result.dense):
-        raise TypeError(f"{len(result.dense) - len(maps)} of {len(result.dense)} submodels were not made by the oracle")
+        raise TypeError(f"{len(result.dense) - len(maps)} of {len(result.dense)} submodels are not simulated")
     return maps
 
 
-def true_relation(target: OracleMaps, source: OracleMaps) -> TrueRelation:
+def true_relation(target: SimulatedMaps, source: SimulatedMaps) -> TrueRelation:
     """The mean over the shared images of ``target_from_source``, as the simulation put each into both submodels.
 
-    Of a mislaid loop segment it is the relation of the half that the submodels share, which an alignment
-    finds; the mistake lies between the halves (``OracleMaps.geometry.mislaid``).
+    Of a false loop it is the relation of the half that the submodels share, which an alignment
+    finds; the mistake lies between the halves (``SimulatedMaps.geometry.false_loop``).
 
     Raises:
         DegenerateAlignmentError: the submodels share no image.

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from smust3r_colmap.errors import ConfigError
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import invert_rigid
-from smust3r_colmap.synthetic.settings import OracleSettings
+from smust3r_colmap.synthetic.settings import SimulationSettings
 from smust3r_colmap.synthetic.truth import TrueScene
 
 POINTS_PER_IMAGE = (6, 8)
@@ -46,7 +46,7 @@ FALSE_REACH = 10
 """Images on either side of false places that a loop segment takes in as well."""
 FALSE_MARGIN = 0.25
 """What such surroundings may truly have in common, summed over pairs of images and relative to what the
-places have in common by mistake: below one, the mistake prevails (``OracleBackbone``), with some to spare."""
+places have in common by mistake: below one, the mistake prevails (``SimulatedBackbone``), with some to spare."""
 
 
 # ------------------------------------------------------------------------------- overlap
@@ -167,7 +167,7 @@ class FalseLoop:
 
 
 def choose_false_loops(
-    overlap: FloatArray, settings: OracleSettings, rng: np.random.Generator
+    overlap: FloatArray, settings: SimulationSettings, rng: np.random.Generator
 ) -> tuple[FalseLoop, ...]:
     """As many pairs of places as the settings ask for, drawn among all that share no surface.
 
@@ -189,7 +189,7 @@ def choose_false_loops(
             chosen.append(FalseLoop(first=tuple(range(a, a + width)), second=tuple(range(b, b + width))))
     if len(chosen) < settings.false_loops:
         raise ConfigError(
-            f"oracle setting false_loops: {settings.false_loops} pairs of places wanted, found {len(chosen)} of "
+            f"simulation setting false_loops: {settings.false_loops} pairs of places wanted, found {len(chosen)} of "
             f"{width} images each, {settings.false_loop_gap} images apart and without common surface"
         )
     return tuple(sorted(chosen, key=lambda loop: loop.first))

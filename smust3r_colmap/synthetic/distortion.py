@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.geometry.so3 import nearest_rotation
-from smust3r_colmap.synthetic.settings import REFERENCE_LENGTH, OracleSettings, WarpGroup
+from smust3r_colmap.synthetic.settings import REFERENCE_LENGTH, SimulationSettings, WarpGroup
 
 FIELD_DEGREE = 3
 """Largest total degree of the polynomials of the smooth depth error: two humps across the image."""
@@ -49,7 +49,7 @@ def homogeneous(b_from_a: FloatArray) -> FloatArray:
 
 
 def drift_steps(
-    num_steps: int, settings: OracleSettings, *, typical_depth: float, rng: np.random.Generator
+    num_steps: int, settings: SimulationSettings, *, typical_depth: float, rng: np.random.Generator
 ) -> FloatArray:
     """(num_steps, 4, 4) error of each step from one camera to the next, independent of each other.
 
@@ -63,7 +63,7 @@ def drift_steps(
     return similarities(rotvec, translation, rng.normal(size=num_steps) * settings.drift_scale * per_step)
 
 
-def chain_steps(world_from_cam: FloatArray, settings: OracleSettings, rng: np.random.Generator) -> FloatArray:
+def chain_steps(world_from_cam: FloatArray, settings: SimulationSettings, rng: np.random.Generator) -> FloatArray:
     """(N - 1, 4, 4) error that the steps of every segment have in common: a turn about one axis of the world.
 
     Args:
@@ -104,7 +104,7 @@ def random_gauge(*, typical_depth: float, rng: np.random.Generator) -> FloatArra
 def random_warp(
     centres_seg: FloatArray, *, amount: float, group: WarpGroup, typical_depth: float, rng: np.random.Generator
 ) -> FloatArray:
-    """(4, 4) a transform of the segment frame with the sizes of ``OracleSettings.warp``.
+    """(4, 4) a transform of the segment frame with the sizes of ``SimulationSettings.warp``.
 
     Args:
         centres_seg: (N, 3) of the cameras; the warp leaves their mean where it is, and the scene is taken
@@ -197,7 +197,7 @@ class DepthError:
 
 
 def depth_error(
-    height: int, width: int, coefficients: FloatArray, settings: OracleSettings, rng: np.random.Generator
+    height: int, width: int, coefficients: FloatArray, settings: SimulationSettings, rng: np.random.Generator
 ) -> DepthError:
     """Smooth error (its (M,) coefficients given), noise and patches of one image."""
     smooth = np.tensordot(coefficients, smooth_basis(height, width), axes=1)
@@ -208,7 +208,7 @@ def depth_error(
 
 
 def _blobs(
-    height: int, width: int, settings: OracleSettings, rng: np.random.Generator
+    height: int, width: int, settings: SimulationSettings, rng: np.random.Generator
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """(H, W) each: by how much a pixel is too deep, relative, and whether the confidence notices.
 

@@ -1,4 +1,4 @@
-"""How wrong the oracle is: every amount, with the reason for its default.
+"""The simulated errors: every amount, with the reason for its default.
 
 The defaults are those of a good network indoors (``PRESETS["network"]``): 1 to 2 % of depth, 0.5 to
 1 degree of rotation over a segment. Amounts that grow along a segment are given for the paper's
@@ -22,7 +22,7 @@ WarpGroup = Literal["affine3", "sl4"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class OracleSettings:
+class SimulationSettings:
     """Amounts of every kind of error; zero of all of them is ``PRESETS["perfect"]``.
 
     Raises:
@@ -93,15 +93,15 @@ class OracleSettings:
         for one in fields(self):
             value = getattr(self, one.name)
             if isinstance(value, (int, float)) and not 0 <= value < float("inf"):
-                raise ConfigError(f"oracle setting {one.name}: {value}, needed 0 or more")
+                raise ConfigError(f"simulation setting {one.name}: {value}, needed 0 or more")
         for name in ("blob_share", "confidence_knows", "failed_share", "dropped_share", "warp"):
             if getattr(self, name) > 1:
-                raise ConfigError(f"oracle setting {name}: {getattr(self, name)}, needed a share from 0 to 1")
+                raise ConfigError(f"simulation setting {name}: {getattr(self, name)}, needed a share from 0 to 1")
         if self.false_loop_images < 3:
-            raise ConfigError(f"oracle setting false_loop_images: {self.false_loop_images}, needed 3 or more")
+            raise ConfigError(f"simulation setting false_loop_images: {self.false_loop_images}, needed 3 or more")
 
 
-_PERFECT = OracleSettings(
+_PERFECT = SimulationSettings(
     scale_jitter=0.0,
     drift_rotation_deg=0.0,
     drift_translation=0.0,
@@ -115,7 +115,7 @@ _PERFECT = OracleSettings(
     confidence_noise=0.0,
     descriptor_noise=0.0,
 )
-_HARD = OracleSettings(
+_HARD = SimulationSettings(
     scale_jitter=0.15,
     drift_rotation_deg=2.0,
     drift_translation=0.03,
@@ -129,8 +129,8 @@ _HARD = OracleSettings(
     confidence_knows=0.25,
     descriptor_noise=0.3,
 )
-PRESETS: Mapping[str, OracleSettings] = MappingProxyType(
-    {"perfect": _PERFECT, "network": OracleSettings(), "hard": _HARD}
+PRESETS: Mapping[str, SimulationSettings] = MappingProxyType(
+    {"perfect": _PERFECT, "network": SimulationSettings(), "hard": _HARD}
 )
 """``perfect``: the truth in the frame of each segment's first camera. ``network``: the defaults.
 ``hard``: about three times as wrong, as on scenes unlike those a network was trained on."""

@@ -1,4 +1,4 @@
-"""What the oracle simulates from: images with exactly known cameras and depth.
+"""What is simulated from: images with exactly known cameras and depth.
 
 ``TrueScene.from_demo`` renders the demo room, ``TrueScene.from_rgbd_folder`` reads a sequence with
 poses and depth maps. Nothing is rendered or read before it is asked for, and nothing twice; an

@@ -21,8 +21,8 @@ from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.products import DenseMaps, SegmentAlignment, SegmentReconstruction, Submodel
 from smust3r_colmap.segmentation.stage import Segments
 from smust3r_colmap.stitching.stitch import stitch_submodels
-from smust3r_colmap.synthetic.backbone import OracleBackbone
-from smust3r_colmap.synthetic.settings import PRESETS, OracleSettings
+from smust3r_colmap.synthetic.backbone import SimulatedBackbone
+from smust3r_colmap.synthetic.settings import PRESETS, SimulationSettings
 from smust3r_colmap.synthetic.truth import TrueScene, collection_of
 
 pytestmark = pytest.mark.slow
@@ -119,8 +119,8 @@ class Run:
         return ablate.solve(self.result, self.segments, self.truth.names, self.config)
 
 
-def simulated(truth: TrueScene, config: RunConfig = CONFIG, settings: OracleSettings = NETWORK) -> Run:
-    backbone = OracleBackbone(truth, collection_of(truth), settings, seed=0)
+def simulated(truth: TrueScene, config: RunConfig = CONFIG, settings: SimulationSettings = NETWORK) -> Run:
+    backbone = SimulatedBackbone(truth, collection_of(truth), settings, seed=0)
     segments = ablate.plan_segments(backbone, config)
     result = backbone.reconstruct(segments.all, with_maps=range(len(segments.all)))
     return Run(truth=truth, config=config, result=result, segments=segments)

@@ -32,12 +32,12 @@ NUM_IMAGES = 60
 
 
 @pytest.fixture(scope="module")
-def room() -> ablate.OracleSet:
-    return ablate.OracleSet(truth=TrueScene.from_demo(NUM_IMAGES, 24, 32), errors=PRESETS["network"])
+def room() -> ablate.SimulatedSet:
+    return ablate.SimulatedSet(truth=TrueScene.from_demo(NUM_IMAGES, 24, 32), errors=PRESETS["network"])
 
 
-def asked(question: str, *, metric: bool = True, oracle: bool = True) -> dict[str, ablate.Configuration]:
-    every = ablate.questions(BASE, num_images=NUM_IMAGES, lengths=(20, 40, 80), metric=metric, oracle=oracle)
+def asked(question: str, *, metric: bool = True, simulated: bool = True) -> dict[str, ablate.Configuration]:
+    every = ablate.questions(BASE, num_images=NUM_IMAGES, lengths=(20, 40, 80), metric=metric, simulated=simulated)
     return {one.label: one for one in every if one.question == question}
 
 
@@ -79,11 +79,11 @@ def test_what_a_backbone_cannot_do_is_not_asked_of_it() -> None:
     assert list(asked("groups")) == ["sim3", "se3", "affine3", "sl4"]
     assert list(asked("groups", metric=False)) == ["sim3", "affine3", "sl4"]
     assert len(asked("loops")) == 5
-    assert len(asked("loops", oracle=False)) == 3
+    assert len(asked("loops", simulated=False)) == 3
 
 
 # ------------------------------------------------------------------------------ outcomes
-def test_closing_a_loop_is_seen_in_the_figures(room: ablate.OracleSet) -> None:
+def test_closing_a_loop_is_seen_in_the_figures(room: ablate.SimulatedSet) -> None:
     loops = asked("loops")
     (off, _), (on, trajectories) = (room.run(loops[label], 0) for label in ("off", "on"))
     assert (off.found, off.closed) == (0, 0)
@@ -99,7 +99,7 @@ def test_closing_a_loop_is_seen_in_the_figures(room: ablate.OracleSet) -> None:
 
 
 def test_false_loops_are_injected_and_told_apart() -> None:
-    room = ablate.OracleSet(truth=TrueScene.from_demo(160, 24, 32), errors=PRESETS["network"])
+    room = ablate.SimulatedSet(truth=TrueScene.from_demo(160, 24, 32), errors=PRESETS["network"])
     assert room.num_false_loops(BASE, 0.0) == 0
     loops = asked("loops")
     clean, _ = room.run(loops["on"], 0)
@@ -112,7 +112,7 @@ def test_false_loops_are_injected_and_told_apart() -> None:
     assert spoilt.ape < 1.1 * clean.ape
 
 
-def test_as_many_false_loops_as_the_scene_has_are_taken(room: ablate.OracleSet) -> None:
+def test_as_many_false_loops_as_the_scene_has_are_taken(room: ablate.SimulatedSet) -> None:
     wanted = room.num_false_loops(BASE, 0.99)
     assert wanted < 99
     assert len(room._backbone(BASE, wanted).false_loops) == wanted
@@ -126,7 +126,7 @@ def test_drift_of_segments_is_the_same_at_the_end_of_every_segment() -> None:
     assert short.depth_distortion == same.depth_distortion
 
 
-def test_a_group_that_bends_leaves_a_residual_of_rigid_cameras(room: ablate.OracleSet) -> None:
+def test_a_group_that_bends_leaves_a_residual_of_rigid_cameras(room: ablate.SimulatedSet) -> None:
     groups = asked("groups")
     assert room.run(groups["sim3"], 0)[0].residual_px == 0
     assert 0.001 < room.run(groups["affine3"], 0)[0].residual_px < 1

@@ -1,4 +1,4 @@
-"""The simulated backbone: the truth when it is told to be perfect, and errors of the stated size when not."""
+"""The simulated backbone: exact with the perfect preset, and errors of the stated size with others."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from smust3r_colmap.products import ImageCollection, Segment
 from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.segmentation.windows import plan_windows
 from smust3r_colmap.synthetic.backbone import (
-    OracleBackbone,
-    OracleMaps,
-    oracle_maps,
+    SimulatedBackbone,
+    SimulatedMaps,
+    simulated_maps,
     taken_for_each_other,
     true_relation,
 )
 from smust3r_colmap.synthetic.descriptors import FALSE_COSINE, FalseLoop, overlap_matrix
 from smust3r_colmap.synthetic.room import demo_intrinsics
-from smust3r_colmap.synthetic.settings import PRESETS, REFERENCE_LENGTH, OracleSettings
+from smust3r_colmap.synthetic.settings import PRESETS, REFERENCE_LENGTH, SimulationSettings
 from smust3r_colmap.synthetic.truth import TYPICAL_DEPTH_IMAGES, TrueScene, collection_of, z_buffer
 
 PERFECT = PRESETS["perfect"]
@@ -46,24 +46,26 @@ def truth() -> TrueScene:
     return TrueScene.from_demo(NUM_IMAGES, HEIGHT, WIDTH)
 
 
-def oracle(truth: TrueScene, settings: OracleSettings, seed: int = 0) -> OracleBackbone:
-    return OracleBackbone(truth, collection_of(truth), settings, seed)
+def simulated(truth: TrueScene, settings: SimulationSettings, seed: int = 0) -> SimulatedBackbone:
+    return SimulatedBackbone(truth, collection_of(truth), settings, seed)
 
 
-def one_submodel(truth: TrueScene, settings: OracleSettings, segment: Segment = WINDOW, seed: int = 0) -> OracleMaps:
-    (maps,) = submodels_of(oracle(truth, settings, seed), [segment])
+def one_submodel(
+    truth: TrueScene, settings: SimulationSettings, segment: Segment = WINDOW, seed: int = 0
+) -> SimulatedMaps:
+    (maps,) = submodels_of(simulated(truth, settings, seed), [segment])
     return maps
 
 
-def submodels_of(backbone: OracleBackbone, segments: Sequence[Segment]) -> tuple[OracleMaps, ...]:
-    return oracle_maps(backbone.reconstruct(segments, with_maps=range(len(segments))))
+def submodels_of(backbone: SimulatedBackbone, segments: Sequence[Segment]) -> tuple[SimulatedMaps, ...]:
+    return simulated_maps(backbone.reconstruct(segments, with_maps=range(len(segments))))
 
 
-def aligned(target: OracleMaps, source: OracleMaps) -> SubmodelFit:
+def aligned(target: SimulatedMaps, source: SimulatedMaps) -> SubmodelFit:
     return align_pointmaps(target.submodel, source.submodel, target, source)
 
 
-def relative_depth(maps: OracleMaps, truth: TrueScene, k: int) -> FloatArray:
+def relative_depth(maps: SimulatedMaps, truth: TrueScene, k: int) -> FloatArray:
     """(H, W) simulated over true depth."""
     ratio: FloatArray = maps.depth(k).astype(np.float64) / truth.depth(maps.submodel.images[k])
     return ratio
@@ -81,7 +83,7 @@ def rms(values: Sequence[float] | FloatArray) -> float:
 @pytest.mark.slow
 def test_perfect_neighbours_align_to_their_true_relation(truth: TrueScene) -> None:
     windows = plan_windows(ViewGraph.chain(NUM_IMAGES), segment_length=60, overlap=30)
-    submodels = submodels_of(oracle(truth, PERFECT), windows)
+    submodels = submodels_of(simulated(truth, PERFECT), windows)
     assert len(submodels) == 3
     for target, source in ((0, 1), (1, 2)):
         found = aligned(submodels[target], submodels[source])
@@ -141,14 +143,14 @@ def test_intrinsics_have_the_size_of_the_collection(truth: TrueScene) -> None:
     small = collection_of(truth)
     images = tuple(replace(image, width=640, height=480) for image in small.images)
     large = ImageCollection(images=images, cameras=(truth.intrinsics.resized(640, 480),))
-    result = OracleBackbone(truth, large, PERFECT).reconstruct([WINDOW], with_maps=[0])
+    result = SimulatedBackbone(truth, large, PERFECT).reconstruct([WINDOW], with_maps=[0])
     assert result.submodels[0].intrinsics[0].params == pytest.approx(demo_intrinsics(640, 480).params)
     np.testing.assert_array_equal(result.dense[0].pointmap_seg(3), one_submodel(truth, PERFECT).pointmap_seg(3))
 
 
-def test_an_oracle_is_a_backbone(truth: TrueScene) -> None:
-    backbone: Backbone = oracle(truth, PERFECT)
-    assert (backbone.name, backbone.metric, backbone.has_tracks) == ("oracle", True, False)
+def test_a_simulated_backbone_is_a_backbone(truth: TrueScene) -> None:
+    backbone: Backbone = simulated(truth, PERFECT)
+    assert (backbone.name, backbone.metric, backbone.has_tracks) == ("simulated", True, False)
     result = backbone.reconstruct([WINDOW], with_maps=[])
     assert result.matches is None
     assert result.rejected == ()
@@ -157,13 +159,13 @@ def test_an_oracle_is_a_backbone(truth: TrueScene) -> None:
 
 # ----------------------------------------------------------------------- size of each error
 def errors_over_seeds(
-    truth: TrueScene, settings: OracleSettings, measure: Callable[[OracleMaps], float], num_seeds: int = 40
+    truth: TrueScene, settings: SimulationSettings, measure: Callable[[SimulatedMaps], float], num_seeds: int = 40
 ) -> float:
     """Root mean square of what is measured in the same segment of many runs."""
     return rms([measure(one_submodel(truth, settings, seed=seed)) for seed in range(num_seeds)])
 
 
-def local_change(maps: OracleMaps) -> FloatArray:
+def local_change(maps: SimulatedMaps) -> FloatArray:
     """(4, 4) how the surroundings of the last image were put into the segment, against those of the first."""
     seg_from_world = maps.geometry.seg_from_world
     change: FloatArray = np.linalg.inv(seg_from_world[0]) @ seg_from_world[-1]
@@ -197,7 +199,7 @@ def test_drift_of_the_scale_is_in_depths_and_in_steps(truth: TrueScene) -> None:
 def test_drift_of_the_chain_has_the_stated_size_and_no_overlap_shows_it(truth: TrueScene) -> None:
     settings = replace(PERFECT, chain_rotation_deg=3.0, chain_scale=0.05)
     windows = plan_windows(ViewGraph.chain(NUM_IMAGES), segment_length=61, overlap=30)
-    first, second, _ = submodels_of(oracle(truth, settings), windows)
+    first, second, _ = submodels_of(simulated(truth, settings), windows)
     for maps in (first, second):
         scale = np.cbrt(np.linalg.det(local_change(maps)[:3, :3]))
         assert abs(np.log(scale)) == pytest.approx(0.05)
@@ -209,7 +211,7 @@ def test_drift_of_the_chain_has_the_stated_size_and_no_overlap_shows_it(truth: T
 
 def test_own_drift_makes_neighbours_disagree_on_the_overlap(truth: TrueScene) -> None:
     windows = plan_windows(ViewGraph.chain(NUM_IMAGES), segment_length=60, overlap=30)
-    network = [submodels_of(oracle(truth, OracleSettings(), seed), windows) for seed in range(10)]
+    network = [submodels_of(simulated(truth, SimulationSettings(), seed), windows) for seed in range(10)]
     relations = [true_relation(first, second) for first, second, _ in network]
     assert 0.1 < np.mean([one.spread_rotation_deg for one in relations]) < 0.5
     assert 0.001 < np.mean([one.spread_log_scale for one in relations]) < 0.007
@@ -324,10 +326,10 @@ def pointmap_in(frame_from_cam: FloatArray, pointmap: npt.NDArray[np.float32]) -
 
 # ---------------------------------------------------------------------- same again, and lazy
 def test_a_segment_comes_out_the_same_whatever_else_is_asked(truth: TrueScene) -> None:
-    settings = replace(OracleSettings(), warp=0.02)
+    settings = replace(SimulationSettings(), warp=0.02)
     alone = one_submodel(truth, settings)
     others = [Segment(index=0, images=(100, 101, 102)), Segment(index=1, images=tuple(reversed(WINDOW.images)))]
-    _, again = submodels_of(oracle(truth, settings), others)
+    _, again = submodels_of(simulated(truth, settings), others)
     np.testing.assert_array_equal(again.submodel.seg_from_cam, alone.submodel.seg_from_cam)
     assert again.submodel.intrinsics == alone.submodel.intrinsics
     later = again.depth(40)
@@ -335,20 +337,20 @@ def test_a_segment_comes_out_the_same_whatever_else_is_asked(truth: TrueScene) -
     np.testing.assert_array_equal(alone.depth(40), later)
     np.testing.assert_array_equal(again.confidence(7), alone.confidence(7))
     np.testing.assert_array_equal(again.pointmap_seg(7), alone.pointmap_seg(7))
-    np.testing.assert_array_equal(oracle(truth, settings).describe(), oracle(truth, settings).describe())
+    np.testing.assert_array_equal(simulated(truth, settings).describe(), simulated(truth, settings).describe())
 
 
 def test_seeds_segments_and_settings_differ(truth: TrueScene) -> None:
-    settings = OracleSettings()
-    base = oracle(truth, settings).reconstruct([WINDOW], with_maps=[])
-    other_seed = oracle(truth, settings, seed=1).reconstruct([WINDOW], with_maps=[])
+    settings = SimulationSettings()
+    base = simulated(truth, settings).reconstruct([WINDOW], with_maps=[])
+    other_seed = simulated(truth, settings, seed=1).reconstruct([WINDOW], with_maps=[])
     assert np.abs(base.dense[0].depth(0) - other_seed.dense[0].depth(0)).max() > 1e-3
     shorter = replace(WINDOW, images=WINDOW.images[:-1])
     assert np.abs(base.dense[0].depth(0) - one_submodel(truth, settings, shorter).depth(0)).max() > 1e-3
-    hard = oracle(truth, PRESETS["hard"]).reconstruct([WINDOW], with_maps=[])
+    hard = simulated(truth, PRESETS["hard"]).reconstruct([WINDOW], with_maps=[])
     assert len({base.dense_key, other_seed.dense_key, hard.dense_key}) == 3
-    assert base.dense_key == oracle(truth, settings).reconstruct([WINDOW], with_maps=[0]).dense_key
-    assert np.abs(oracle(truth, settings).describe() - oracle(truth, settings, seed=1).describe()).max() > 1e-3
+    assert base.dense_key == simulated(truth, settings).reconstruct([WINDOW], with_maps=[0]).dense_key
+    assert np.abs(simulated(truth, settings).describe() - simulated(truth, settings, seed=1).describe()).max() > 1e-3
 
 
 def test_one_error_leaves_the_draws_of_the_others_alone(truth: TrueScene) -> None:
@@ -380,7 +382,7 @@ def test_maps_are_made_when_they_are_read(truth: TrueScene) -> None:
     views = CountedViews(truth)
     counted = replace(truth, views=views)
     windows = plan_windows(ViewGraph.chain(NUM_IMAGES), segment_length=60, overlap=30)
-    result = oracle(counted, OracleSettings()).reconstruct(windows, with_maps=range(3))
+    result = simulated(counted, SimulationSettings()).reconstruct(windows, with_maps=range(3))
     assert len(views.depths) <= TYPICAL_DEPTH_IMAGES + 1, "some for the size of the scene, one for the key"
     assert len(views.rgbs) <= 1
     before = len(views.depths)
@@ -401,7 +403,7 @@ def test_reading_a_map_gives_a_copy(truth: TrueScene) -> None:
 
 # ------------------------------------------------------------------------------ descriptors
 def test_descriptors_tell_near_images_from_far_ones(truth: TrueScene) -> None:
-    backbone = oracle(truth, OracleSettings())
+    backbone = simulated(truth, SimulationSettings())
     descriptors = backbone.describe()
     assert descriptors.dtype == np.float32
     np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, atol=1e-5)
@@ -415,13 +417,13 @@ def test_descriptors_tell_near_images_from_far_ones(truth: TrueScene) -> None:
 
 
 def test_descriptor_noise_lowers_cosines_as_stated(truth: TrueScene) -> None:
-    clean, noisy = (oracle(truth, replace(PERFECT, descriptor_noise=noise)).describe() for noise in (0.0, 0.5))
+    clean, noisy = (simulated(truth, replace(PERFECT, descriptor_noise=noise)).describe() for noise in (0.0, 0.5))
     ratio = np.diag(noisy @ noisy.T, 1).mean() / np.diag(clean @ clean.T, 1).mean()
     assert ratio == pytest.approx(1 / (1 + 0.5**2), rel=0.05)
 
 
 def test_overlap_is_measured_and_symmetric(truth: TrueScene) -> None:
-    overlap = oracle(truth, PERFECT).overlap
+    overlap = simulated(truth, PERFECT).overlap
     np.testing.assert_array_equal(overlap, overlap.T)
     assert 0 <= overlap.min() < overlap.max() <= 1
     assert overlap[0, 1] > 0.8
@@ -452,7 +454,7 @@ WITH_FALSE_LOOPS = replace(PERFECT, false_loops=2, false_loop_gap=40)
 
 
 def test_false_loops_look_alike_and_share_nothing(truth: TrueScene) -> None:
-    backbone, honest = oracle(truth, WITH_FALSE_LOOPS), oracle(truth, PERFECT)
+    backbone, honest = simulated(truth, WITH_FALSE_LOOPS), simulated(truth, PERFECT)
     cosines, before = (one.describe() @ one.describe().T for one in (backbone, honest))
     assert len(backbone.false_loops) == 2
     taken = [image for loop in backbone.false_loops for image in (*loop.first, *loop.second)]
@@ -468,42 +470,42 @@ def test_false_loops_look_alike_and_share_nothing(truth: TrueScene) -> None:
     np.testing.assert_allclose(cosines[np.ix_(untouched, untouched)], before[np.ix_(untouched, untouched)], atol=1e-5)
 
 
-def false_segment(backbone: OracleBackbone, reach: int = 5) -> Segment:
+def false_segment(backbone: SimulatedBackbone, reach: int = 5) -> Segment:
     loop = backbone.false_loops[0]
     halves = [range(max(p[0] - reach, 0), min(p[-1] + reach + 1, NUM_IMAGES)) for p in (loop.first, loop.second)]
     return Segment(index=9, images=(*halves[0], *halves[1]), kind="loop")
 
 
 def test_a_false_loop_is_laid_onto_itself_and_looks_sound(truth: TrueScene) -> None:
-    backbone = oracle(truth, WITH_FALSE_LOOPS)
+    backbone = simulated(truth, WITH_FALSE_LOOPS)
     segment, loop = false_segment(backbone), backbone.false_loops[0]
-    mislaid = one_submodel(truth, WITH_FALSE_LOOPS, segment)
-    assert mislaid.geometry.mislaid
+    false_loop = one_submodel(truth, WITH_FALSE_LOOPS, segment)
+    assert false_loop.geometry.false_loop
     a, b = (segment.images.index(image) for image in (loop.first[3], loop.second[3]))
-    np.testing.assert_allclose(mislaid.submodel.seg_from_cam[a], mislaid.submodel.seg_from_cam[b], atol=1e-9)
-    assert mislaid.confidence(b).min() > 9
+    np.testing.assert_allclose(false_loop.submodel.seg_from_cam[a], false_loop.submodel.seg_from_cam[b], atol=1e-9)
+    assert false_loop.confidence(b).min() > 9
     for images in (range(loop.first[0] - 5, loop.first[-1] + 6), range(loop.second[0] - 5, loop.second[-1] + 6)):
         window = one_submodel(truth, PERFECT, Segment(index=0, images=tuple(i for i in images if 0 <= i < NUM_IMAGES)))
-        found = aligned(mislaid, window)
-        expected = true_relation(mislaid, window)
+        found = aligned(false_loop, window)
+        expected = true_relation(false_loop, window)
         np.testing.assert_allclose(found.estimate.b_from_a.matrix, expected.target_from_source, atol=1e-5)
         assert found.relative_residual < 1e-5, "each half by itself is right"
     as_window = one_submodel(truth, WITH_FALSE_LOOPS, replace(segment, kind="window"))
-    assert not as_window.geometry.mislaid
+    assert not as_window.geometry.false_loop
 
 
 def test_a_true_loop_comes_out_right_even_where_false_ones_exist(truth: TrueScene) -> None:
     maps = one_submodel(truth, WITH_FALSE_LOOPS, TRUE_LOOP)
-    assert not maps.geometry.mislaid
+    assert not maps.geometry.false_loop
     expected = invert_rigid(truth.world_from_cam[0]) @ np.vstack([truth.world_from_cam[119], [0, 0, 0, 1]])
     np.testing.assert_allclose(maps.submodel.seg_from_cam[-1], expected, atol=1e-9)
-    noisy = one_submodel(truth, replace(OracleSettings(), scale_jitter=0.0), TRUE_LOOP)
+    noisy = one_submodel(truth, replace(SimulationSettings(), scale_jitter=0.0), TRUE_LOOP)
     assert 1e-3 < np.linalg.norm(noisy.submodel.seg_from_cam[-1, :, 3] - expected[:, 3]) < 0.1
 
 
 def test_halves_that_say_nothing_are_laid_onto_each_other_too(truth: TrueScene) -> None:
     maps = one_submodel(truth, PERFECT, Segment(index=0, images=(*range(5), *range(60, 65)), kind="loop"))
-    assert maps.geometry.mislaid
+    assert maps.geometry.false_loop
     np.testing.assert_allclose(maps.submodel.seg_from_cam[2], maps.submodel.seg_from_cam[7], atol=1e-9)
 
 
@@ -524,14 +526,14 @@ def test_the_stronger_evidence_decides_what_is_taken_for_what() -> None:
 # ---------------------------------------------------------------------------------- failures
 def test_segments_fail_and_images_drop_in_the_stated_share(truth: TrueScene) -> None:
     segments = [Segment(index=k, images=tuple(range(k, k + 20))) for k in range(100)]
-    failing = oracle(truth, replace(PERFECT, failed_share=0.3)).reconstruct(segments, with_maps=[])
+    failing = simulated(truth, replace(PERFECT, failed_share=0.3)).reconstruct(segments, with_maps=[])
     failed = [one for one in failing.reconstructions if not one.submodels]
     assert 20 < len(failed) < 40
     assert len(failing.dense) == len(failing.submodels) == 100 - len(failed)
     assert len(failed[0].unregistered) == 20
-    assert "told to fail" in failed[0].unregistered[0].reason
+    assert "simulation fails" in failed[0].unregistered[0].reason
 
-    dropping = oracle(truth, replace(PERFECT, dropped_share=0.1)).reconstruct(segments, with_maps=[])
+    dropping = simulated(truth, replace(PERFECT, dropped_share=0.1)).reconstruct(segments, with_maps=[])
     dropped = sum(len(one.unregistered) for one in dropping.reconstructions)
     assert 150 < dropped < 250
     for one, segment in zip(dropping.reconstructions, segments, strict=True):
@@ -588,7 +590,7 @@ def test_a_folder_without_names_gives_all_its_images(rgbd_folder: Path) -> None:
 
 def test_pixels_without_depth_stay_without(rgbd_folder: Path) -> None:
     read = TrueScene.from_rgbd_folder(rgbd_folder, NAMES, max_size=48)
-    maps = one_submodel(read, OracleSettings(), Segment(index=0, images=(4, 5)))
+    maps = one_submodel(read, SimulationSettings(), Segment(index=0, images=(4, 5)))
     assert np.isnan(maps.pointmap_seg(0)[0, 0]).all()
     assert maps.depth(0)[0, 0] == 0
     assert maps.confidence(0)[0, 0] == 1
@@ -611,7 +613,7 @@ def test_kitchen_becomes_segments_with_depth_in_every_frame(data_dir: Callable[[
     assert 1.0 < kitchen.typical_depth < 3.0
     assert min(np.mean(kitchen.depth(k) > 0) for k in range(24)) > 0.7
     windows = plan_windows(ViewGraph.chain(24), segment_length=16, overlap=8)
-    target, source = submodels_of(oracle(kitchen, PERFECT), windows)
+    target, source = submodels_of(simulated(kitchen, PERFECT), windows)
     found = aligned(target, source)
     np.testing.assert_allclose(
         found.estimate.b_from_a.matrix, true_relation(target, source).target_from_source, atol=1e-5
@@ -624,27 +626,27 @@ def test_kitchen_becomes_segments_with_depth_in_every_frame(data_dir: Callable[[
 # ---------------------------------------------------------------------------------- refusals
 def test_settings_that_make_no_sense_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"depth_noise: -0.1"):
-        OracleSettings(depth_noise=-0.1)
+        SimulationSettings(depth_noise=-0.1)
     with pytest.raises(ConfigError, match=r"focal_error: nan"):
-        OracleSettings(focal_error=float("nan"))
+        SimulationSettings(focal_error=float("nan"))
     with pytest.raises(ConfigError, match=r"blob_share: 1.5"):
-        OracleSettings(blob_share=1.5)
+        SimulationSettings(blob_share=1.5)
     with pytest.raises(ConfigError, match=r"false_loop_images: 2"):
-        OracleSettings(false_loop_images=2)
+        SimulationSettings(false_loop_images=2)
 
 
 def test_more_false_loops_than_the_scene_has_are_refused(truth: TrueScene) -> None:
     with pytest.raises(ConfigError, match=r"500 pairs of places wanted, found \d+ of 7 images each"):
-        oracle(truth, replace(PERFECT, false_loops=500, false_loop_gap=40)).describe()
+        simulated(truth, replace(PERFECT, false_loops=500, false_loop_gap=40)).describe()
 
 
 def test_another_collection_is_refused(truth: TrueScene) -> None:
     collection = collection_of(truth)
     with pytest.raises(CollectionError, match=r"119 images in the collection, 120 known exactly"):
-        OracleBackbone(truth, ImageCollection(images=collection.images[:-1], cameras=collection.cameras), PERFECT)
+        SimulatedBackbone(truth, ImageCollection(images=collection.images[:-1], cameras=collection.cameras), PERFECT)
     swapped = (collection.images[1], collection.images[0], *collection.images[2:])
     with pytest.raises(CollectionError, match=r"first that differ are 000001.jpg and 000000.jpg"):
-        OracleBackbone(truth, ImageCollection(images=swapped, cameras=collection.cameras), PERFECT)
+        SimulatedBackbone(truth, ImageCollection(images=swapped, cameras=collection.cameras), PERFECT)
 
 
 def test_submodels_without_shared_images_have_no_true_relation(truth: TrueScene) -> None:

@@ -1,11 +1,11 @@
-"""A whole run with the oracle on an RGB-D data set: what the way from segments to the workspace keeps of good depth.
+"""A whole run with a simulated backbone on an RGB-D data set: the error that the pipeline itself adds to good depth.
 
-    python scripts/reconstruct_with_oracle.py ../shared/data/kitchen_rgbd OUT --workers 1
+    python scripts/reconstruct_with_simulated_backbone.py ../shared/data/kitchen_rgbd OUT --workers 1
     python scripts/judge_depth_maps.py OUT ../shared/data/kitchen_rgbd
 
-The oracle (``backbones.oracle``) stands in for a network: cameras and depth of the data set, disturbed by what a
-preset says that a network gets wrong. All else is the usual run, refinement by SIFT and ``dense/`` included; only
-``trainer/`` is left out, which nobody judges. The data set has ``images/``, ``depth/*.png`` (16 bits, millimetres),
+The simulated backbone (``synthetic.backbone``) takes the place of a network: cameras and depth of the data set, with
+the simulated errors of a preset. All else is the usual run, refinement by SIFT and ``dense/`` included. Only
+``trainer/``, which is not evaluated, is left out. The data set has ``images/``, ``depth/*.png`` (16 bits, millimetres),
 ``poses.txt`` and ``intrinsics.txt`` of a Kinect's depth sensor.
 
 Photographs are those of the colour camera, an inch beside the sensor. What the sensor measured is therefore
@@ -37,7 +37,7 @@ from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.storage.run_directory import storage_errors
-from smust3r_colmap.synthetic.backbone import OracleBackbone
+from smust3r_colmap.synthetic.backbone import SimulatedBackbone
 from smust3r_colmap.synthetic.distortion import homogeneous
 from smust3r_colmap.synthetic.settings import PRESETS
 from smust3r_colmap.synthetic.truth import TrueScene
@@ -50,7 +50,7 @@ COLOUR_CAMERA = Intrinsics(model="SIMPLE_RADIAL", width=640, height=480, params=
 """Of the photographs, for ``intrinsics.txt`` has the sensor's: one of the 200 that COLMAP's global mapper finds on
 kitchen_rgbd, whose focal lengths have a median of 531.6 and a deviation of 3.5 px."""
 MAP_SIZE_PX = (384, 288)
-"""Width and height of the oracle's maps: as large as those of the classical backbone, and three fifths of the
+"""Width and height of the simulated maps: as large as those of the classical backbone, and three fifths of the
 sensor's, so that the readings leave no holes in a surface."""
 
 
@@ -58,7 +58,7 @@ def main(words: Sequence[str] | None = None) -> int:
     """Reconstruct the data set named on the command line; exit codes as those of ``smust3r-colmap reconstruct``."""
     arguments = parse_arguments(words)
     config = RunConfig(
-        backbone="oracle",
+        backbone="simulated",
         backbone_options=f"preset={arguments.preset}",
         output=OutputConfig(trainer=False, dense=not arguments.no_dense),
         workers=arguments.workers or "auto",
@@ -70,7 +70,7 @@ def main(words: Sequence[str] | None = None) -> int:
             arguments.output,
             config,
             reporter=reporter_for(sys.stderr, quiet=False),
-            factory=oracle_factory(arguments.data, arguments.preset),
+            factory=factory_of(arguments.data, arguments.preset),
         )
     except SmustrError as error:
         print(error, file=sys.stderr)
@@ -90,9 +90,7 @@ def parse_arguments(words: Sequence[str] | None) -> argparse.Namespace:
         metavar="FILE",
         help=f"names of the images to take, one a line (DATA/{SUBSET_FILE}, or else all)",
     )
-    parser.add_argument(
-        "--preset", choices=sorted(PRESETS), default="network", help="errors of the oracle (%(default)s)"
-    )
+    parser.add_argument("--preset", choices=sorted(PRESETS), default="network", help="simulated errors (%(default)s)")
     parser.add_argument("--workers", type=int, help="processes; by default one per core")
     parser.add_argument("--no-dense", action="store_true", help="leave out the dense workspace")
     return parser.parse_args(words)
@@ -152,15 +150,15 @@ def is_plain_folder(path: Path) -> bool:
     return path.is_dir() and not path.is_symlink()
 
 
-# ------------------------------------------------------------------------------- oracle
-def oracle_factory(data: Path, preset: str) -> BackboneFactory:
-    """What makes the oracle of a data set for the images of the run."""
+# ----------------------------------------------------------------------------- backbone
+def factory_of(data: Path, preset: str) -> BackboneFactory:
+    """Makes the simulated backbone of a data set for the images of the run."""
 
-    def make_oracle(context: BackboneContext) -> OracleBackbone:
+    def make_simulated(context: BackboneContext) -> SimulatedBackbone:
         truth = colour_scene(data, [image.name for image in context.collection.images])
-        return OracleBackbone(truth, context.collection, PRESETS[preset], context.config.seed)
+        return SimulatedBackbone(truth, context.collection, PRESETS[preset], context.config.seed)
 
-    return make_oracle
+    return make_simulated
 
 
 def colour_scene(data: Path, names: Sequence[str]) -> TrueScene:

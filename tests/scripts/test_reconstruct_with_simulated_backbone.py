@@ -1,4 +1,4 @@
-"""The script that runs the oracle on an RGB-D data set: its scene, its links, its refusals, and a short whole run."""
+"""The script that runs the simulated backbone on an RGB-D data set: its scene, links and refusals, and a short run."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import reconstruct_with_oracle as script
+import reconstruct_with_simulated_backbone as script
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -150,7 +150,7 @@ def test_the_kitchen_without_errors_comes_out_in_metres(
     assert script.main(words) == 0
     assert "6 of 6 images have a pose. Scale: metres." in capsys.readouterr().out
     config = (output / "config.toml").read_text()
-    assert 'backbone = "oracle"' in config and 'backbone_options = "preset=perfect"' in config
+    assert 'backbone = "simulated"' in config and 'backbone_options = "preset=perfect"' in config
     found = compare_trajectories(read_reference_sparse(output / "sparse/0"), read_poses_txt(data / "poses.txt"))
     assert found.num_compared == 6
     assert found.reference_from_estimated.scale == pytest.approx(1, abs=0.05)
