@@ -17,7 +17,7 @@ import re
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from http import HTTPStatus
 from pathlib import Path
@@ -90,26 +90,22 @@ class _Version:
     num_bytes: int
     validator: str
 
-    def may_be(self, other: _Version) -> bool:
+    def may_be(self, other: _Version | None) -> bool:
         """Nothing speaks against them being the same."""
-        validators = {self.validator, other.validator} - {""}
-        return self.num_bytes == other.num_bytes and len(validators) <= 1
+        if other is None or self.num_bytes != other.num_bytes:
+            return False
+        return self.validator == other.validator or not (self.validator and other.validator)
 
 
 class _Part:
-    """The bytes that have come so far, and the version of the file that they are of."""
+    """The bytes that have come so far, and the version of the file that they are of; None where that is unknown."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._version_path = path.with_name(f"{path.name}.json")
-
-    @property
-    def version(self) -> _Version | None:
-        """None where nothing was begun, or where its note cannot be read."""
-        try:
-            return _Version(**json.loads(self._version_path.read_text(encoding="utf-8")))
-        except (OSError, ValueError, TypeError):
-            return None
+        self.version: _Version | None = None
+        with suppress(OSError, ValueError, TypeError):
+            self.version = _Version(**json.loads(self._version_path.read_text(encoding="utf-8")))
 
     @property
     def num_bytes(self) -> int:
@@ -119,28 +115,21 @@ class _Part:
     @property
     def is_whole(self) -> bool:
         """All bytes are there."""
-        version = self.version
-        return version is not None and self.num_bytes == version.num_bytes
+        return self.version is not None and self.num_bytes == self.version.num_bytes
 
     def begin(self, version: _Version) -> None:
         """Empty, of a version; in this order, so that old bytes never pass for those of a new version."""
         with _disk_errors(self.path):
             self.path.write_bytes(b"")
             self._version_path.write_text(json.dumps(asdict(version)), encoding="utf-8")
+        self.version = version
 
     def remove(self) -> None:
         """As if nothing had come."""
+        self.version = None
         with _disk_errors(self.path):
             self.path.unlink(missing_ok=True)
             self._version_path.unlink(missing_ok=True)
-
-    def headers(self) -> dict[str, str]:
-        """Ask for the rest, on condition that the version is still the same; for everything when there is no part."""
-        version, num_bytes = self.version, self.num_bytes
-        if version is None or num_bytes == 0:
-            return {}
-        condition = {"If-Range": version.validator} if version.validator else {}
-        return {"Range": f"bytes={num_bytes}-", **condition}
 
 
 def _fetch_whole(address: str, part: _Part, reporter: Reporter, *, timeout_s: float, pause_s: float) -> None:
@@ -162,14 +151,14 @@ def _fetch_whole(address: str, part: _Part, reporter: Reporter, *, timeout_s: fl
 
 def _fetch_rest(address: str, part: _Part, reporter: Reporter, *, timeout_s: float) -> None:
     """One request: append to the part what is missing, or begin it anew if the server has another file."""
-    had, known = part.num_bytes, part.version
+    had = part.num_bytes
     with _answer(address, part, timeout_s) as response:
         first_byte, version = _span(address, response)
         if first_byte not in (0, had):
             raise DownloadError(
                 f"{address}: asked for the bytes from {had} on, the server sends those from {first_byte} on; {_BY_HAND}"
             )
-        if first_byte == 0 or known is None or not known.may_be(version):
+        if first_byte == 0 or not version.may_be(part.version):
             if had:
                 reporter.note(f"{address}: has changed, or comes only as a whole; starting over")
             part.begin(version)
@@ -180,7 +169,11 @@ def _fetch_rest(address: str, part: _Part, reporter: Reporter, *, timeout_s: flo
 
 def _answer(address: str, part: _Part, timeout_s: float) -> requests.Response:
     """What the server says to the request for what is missing: status 200 (everything) or 206 (the rest)."""
-    headers = {"User-Agent": f"smust3r-colmap/{__version__}", "Accept-Encoding": "identity", **part.headers()}
+    headers = {"User-Agent": f"smust3r-colmap/{__version__}", "Accept-Encoding": "identity"}
+    if part.num_bytes:
+        headers["Range"] = f"bytes={part.num_bytes}-"
+        if part.version and part.version.validator:
+            headers["If-Range"] = part.version.validator
     try:
         response = requests.get(address, headers=headers, stream=True, timeout=timeout_s)
     except requests.RequestException as error:
