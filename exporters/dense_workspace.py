@@ -34,9 +34,11 @@ import pycolmap
 from PIL import Image
 
 from smust3r_colmap.dense.depth_consistency import ModelDepth, depth_of_model
+from smust3r_colmap.dense.normals import surface_normals
 from smust3r_colmap.errors import ImageError, InputError, ReconstructionError, StorageError
 from smust3r_colmap.execution.task_pool import TaskFailure, in_child, usable_cores
-from smust3r_colmap.geometry.arrays import FloatArray
+from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
+from smust3r_colmap.geometry.depth_noise import VIEW_AGREEMENT
 from smust3r_colmap.importers.images import inspect, load_rgb, stored_orientation
 from smust3r_colmap.products import DepthMaps, SourceImage
 from smust3r_colmap.storage.atomic_write import atomic_folder
@@ -57,19 +59,9 @@ WORKSPACE_ENTRIES = frozenset(
 )
 """What an older workspace may hold and is replaced with it."""
 
-NORMAL_RADIUS_PX = 3
-"""Pixels round a pixel whose depth makes its normal. Depth of neighbouring pixels scatters by about a percent, which
-over one pixel's width turns a normal by 45 degrees, and over seven by a few."""
-MIN_NORMAL_PIXELS = 8
-"""Pixels on the same surface that a normal needs."""
-SAME_SURFACE_RELATIVE_DEPTH = 0.05
-"""Relative difference of depth up to which two pixels of a window are one surface."""
-
 MIN_FUSED_VIEWS = 3
 """Pixels per fused point (COLMAP: 5). Every depth here has been confirmed by two other views, and maps of small
 images seen once per place have no five."""
-FUSED_RELATIVE_DEPTH_ERROR = 0.02
-"""Relative (COLMAP: 0.01); what two views had to agree within to be kept."""
 FUSED_REPROJECTION_PX = 1.0
 """COLMAP: 2, for maps of full size. Two pixels of a small map are a large patch: of a courtyard in 30 maps of 384
 pixels 87,000 points were left instead of 158,000, and their normals scattered by a third more."""
@@ -316,8 +308,9 @@ def _write_maps(
 ) -> _WrittenMap:
     """Write the depth and the normals of one image."""
     image = undistorted.find_image_with_name(workspace_name)
-    img_from_cam = np.asarray(undistorted.camera(image.camera_id).calibration_matrix())
-    normals = normals_of_depth(found.depth, img_from_cam)
+    pinhole = Intrinsics.from_colmap(undistorted.camera(image.camera_id))
+    rays = pinhole.rays_cam(pixel_centres(pinhole.width, pinhole.height))
+    normals, _ = surface_normals(found.depth, rays[:, :2].reshape(*found.depth.shape, 2))
     write_map(workspace / f"stereo/depth_maps/{workspace_name}.geometric.bin", found.depth)
     write_map(workspace / f"stereo/normal_maps/{workspace_name}.geometric.bin", normals)
     return _WrittenMap(
@@ -341,78 +334,6 @@ def write_map(path: Path, values: FloatMap) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     header = f"{width}&{height}&{channels}&".encode("ascii")
     path.write_bytes(header + np.ascontiguousarray(planes, dtype="<f4").tobytes())
-
-
-def normals_of_depth(depth: FloatMap, img_from_cam: FloatArray) -> FloatMap:
-    """Unit normals (H, W, 3) float32 in the camera's axes, facing the camera; zero where there is no depth.
-
-    The inverse depth of a plane n . x = 1 is n . ray, which is linear in the pixel coordinates: a x + b y + c. It is
-    fitted by least squares to the pixels of the same surface in the window of ``NORMAL_RADIUS_PX`` round each pixel,
-    and (a, b, c) = n img_from_cam^-1 gives n. Pixels with fewer than ``MIN_NORMAL_PIXELS`` such neighbours, or with
-    all of them on a line, face the camera.
-
-    Args:
-        depth: (H, W) z-depth, 0 where there is none.
-        img_from_cam: (3, 3) calibration matrix of the pinhole, pixel centres at (j + 0.5, i + 0.5).
-    """
-    height, width = depth.shape
-    known = depth > 0
-    inverse = np.divide(1, depth, out=np.zeros_like(depth), where=known)
-    sums = _window_sums(inverse, known)
-    slope_x, slope_y, determined = _fitted_slopes(sums)
-    x, y = np.arange(width) + 0.5, (np.arange(height) + 0.5)[:, None]
-    # The plane through the pixel itself: only its slopes come from the window.
-    offset = inverse - slope_x * x - slope_y * y
-    towards = -np.stack([slope_x, slope_y, offset], axis=-1) @ img_from_cam
-    pixels = np.stack(np.broadcast_arrays(x, y, 1.0), axis=-1)
-    viewing = -pixels @ np.linalg.inv(img_from_cam).T
-    normals = np.where(determined[..., None], towards, viewing)
-    lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
-    unit = np.divide(normals, lengths, out=np.zeros_like(normals), where=known[..., None] & (lengths > 0))
-    facing: FloatMap = unit.astype(np.float32)
-    return facing
-
-
-def _window_sums(inverse: FloatMap, known: npt.NDArray[np.bool_]) -> FloatMap:
-    """(9, H, W) sums over each window of 1, dx, dy, dx dx, dx dy, dy dy, d, dx d, dy d with d the change of 1 / depth.
-
-    Only pixels whose inverse depth differs from the middle's by at most ``SAME_SURFACE_RELATIVE_DEPTH`` of it count.
-    """
-    height, width = inverse.shape
-    padded = np.pad(inverse, NORMAL_RADIUS_PX)
-    tolerance = np.where(known, np.float32(SAME_SURFACE_RELATIVE_DEPTH) * inverse, np.float32(-1))
-    sums = np.zeros((9, height, width), np.float32)
-    for dy in range(-NORMAL_RADIUS_PX, NORMAL_RADIUS_PX + 1):
-        # Sums over one row of the window, of 1, dx, dx dx and of d, dx d; its counts fit 8 bits.
-        counts, changes = np.zeros((3, height, width), np.int8), np.zeros((2, height, width), np.float32)
-        for dx in range(-NORMAL_RADIUS_PX, NORMAL_RADIUS_PX + 1):
-            top, left = NORMAL_RADIUS_PX + dy, NORMAL_RADIUS_PX + dx
-            change = padded[top : top + height, left : left + width] - inverse
-            same = np.abs(change) <= tolerance
-            change *= same
-            for power in range(3):
-                counts[power] += np.int8(dx**power) * same
-            for power in range(2):
-                changes[power] += np.float32(dx**power) * change
-        (n, x, xx), (d, xd) = counts, changes
-        of_row = ((n, 1), (x, 1), (n, dy), (xx, 1), (x, dy), (n, dy * dy), (d, 1), (xd, 1), (d, dy))
-        for number, (along_x, factor) in enumerate(of_row):
-            sums[number] += np.float32(factor) * along_x
-    return sums
-
-
-def _fitted_slopes(sums: FloatMap) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_]]:
-    """Slopes of inverse depth along x and y (H, W) from the normal equations, and where there are any."""
-    n, x, y, xx, xy, yy, d, xd, yd = sums.astype(np.float64)
-    n = np.maximum(n, 1)
-    # Centred on the mean place of the pixels that count, which removes the constant.
-    xx, xy, yy, xd, yd = xx - x * x / n, xy - x * y / n, yy - y * y / n, xd - x * d / n, yd - y * d / n
-    determinant = xx * yy - xy * xy
-    determined = (n >= MIN_NORMAL_PIXELS) & (determinant > 1e-6 * (xx + yy) ** 2)
-    safe = np.where(determined, determinant, 1)
-    slope_x = np.where(determined, (yy * xd - xy * yd) / safe, 0)
-    slope_y = np.where(determined, (xx * yd - xy * xd) / safe, 0)
-    return slope_x, slope_y, determined
 
 
 def _write_lines(path: Path, lines: Iterable[str]) -> None:
@@ -466,7 +387,7 @@ def _run_fusion(task: _FusionTask) -> int:
     options = pycolmap.StereoFusionOptions()
     options.min_num_pixels = MIN_FUSED_VIEWS
     options.max_reproj_error = FUSED_REPROJECTION_PX
-    options.max_depth_error = FUSED_RELATIVE_DEPTH_ERROR
+    options.max_depth_error = VIEW_AGREEMENT  # COLMAP: 0.01; every depth was confirmed within this
     options.max_normal_error = FUSED_NORMAL_ERROR_DEG
     options.check_num_images = MAX_FUSED_NEIGHBOURS
     options.num_threads = 1  # several start new points in the order of their luck, and the cloud differs every time

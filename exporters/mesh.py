@@ -41,6 +41,7 @@ from smust3r_colmap.errors import InputError, MissingDependencyError, Reconstruc
 from smust3r_colmap.execution.task_pool import TaskFailure, in_child
 from smust3r_colmap.geometry.arrays import BoolArray, FloatArray, IntArray, UInt8Array
 from smust3r_colmap.geometry.camera import pixel_centres
+from smust3r_colmap.geometry.depth_noise import VISIBILITY
 from smust3r_colmap.storage.atomic_write import write_atomically
 
 MIN_POINTS = 100
@@ -58,8 +59,6 @@ MAX_COARSER_LEVELS = 1.5
 a thousand farther than eight point spacings from any point, three levels leave fifteen."""
 VOXEL_PER_PIXEL = 1.5
 """Edge of a voxel over the width of a pixel at the median depth."""
-TRUNCATION_PER_DEPTH = 0.03
-"""Distance from the surface, over the median depth, up to which a depth map counts: more than depth maps disagree."""
 MAX_GRID_VOXELS = 1024
 """Voxels along the longest side of the bulk at most."""
 BLOCK_VOXELS, FIRST_BLOCKS = 8, 10_000
@@ -76,8 +75,6 @@ MIN_NEW_FACES_SHARE = 2e-3
 """Images are added to the texture while they show at least this part of the faces for the first time."""
 MAX_FACES_TO_CHOOSE_BY = 50_000
 """Faces, evenly drawn, by which the images are chosen; all images times all faces would not fit in memory."""
-RELATIVE_DEPTH_TOLERANCE = 0.03
-"""Relative difference between a face and the depth map up to which the image sees it, and nothing before it."""
 MIN_VIEW_COSINE = 0.15
 """Cosine between a face's normal and the direction to the camera; flatter views smear."""
 BETTER_VIEW_RATIO = 1.5
@@ -347,7 +344,7 @@ def _voxel_size(views: Sequence[_View], box: tuple[FloatArray, FloatArray]) -> t
         raise ReconstructionError("no depth map has a pixel")
     finest = float((box[1] - box[0]).max()) / MAX_GRID_VOXELS
     voxel = max(VOXEL_PER_PIXEL * float(np.median(pixels)), finest)
-    return voxel, max(TRUNCATION_PER_DEPTH * float(np.median(depths)), 3 * voxel)
+    return voxel, max(VISIBILITY * float(np.median(depths)), 3 * voxel)
 
 
 def _cleaned(open3d: Any, mesh: Any) -> _Mesh:
@@ -415,7 +412,7 @@ def _pixels_per_face(mesh: _Mesh, faces: IntArray, view: _View) -> FloatArray:
     facing = np.einsum("fi,fi->f", normals, to_camera) > MIN_VIEW_COSINE * lengths
     xy, z = view.project(centres)
     column, row = np.clip(xy.astype(np.intp), 0, (view.width - 1, view.height - 1)).T
-    visible = np.abs(view.depth()[row, column] - z) <= RELATIVE_DEPTH_TOLERANCE * z
+    visible = np.abs(view.depth()[row, column] - z) <= VISIBILITY * z
     (ux, uy), (vx, vy) = (b - a).T, (c - a).T
     pixels[rows] = np.where(facing & visible, np.abs(ux * vy - uy * vx) / 2, 0)
     return pixels

@@ -26,6 +26,7 @@ from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.estimators.confidence import ConfidenceWeighting
 from smust3r_colmap.estimators.robust import RobustKernel, RobustLoss, evenly_chosen
 from smust3r_colmap.geometry.arrays import Pair
+from smust3r_colmap.geometry.depth_noise import SUBMODEL_AGREEMENT
 from smust3r_colmap.geometry.groups import GROUPS, TransformGroup, embed
 from smust3r_colmap.geometry.so3 import angles_between
 from smust3r_colmap.geometry.transform import Transform
@@ -41,9 +42,6 @@ from smust3r_colmap.products import (
 
 logger = logging.getLogger(__name__)
 
-MAX_RELATIVE_RESIDUAL = 0.05
-"""Median residual over depth; sound edges have 0.0003 to 0.046, broken ones 0.15 to 0.76
-(measured on six real sets)."""
 MIN_SHARED_TRACKS = 30
 """Common points; COLMAP asks for 30 to register a single image."""
 MIN_MATCH_INLIERS = 12
@@ -322,8 +320,8 @@ def _align_by_matches(
 
 def _rejection(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
     """Why an edge from shared images is rejected, or empty."""
-    if not fit.relative_residual <= MAX_RELATIVE_RESIDUAL:
-        return f"median residual is {fit.relative_residual:.3f} of the depth, at most {MAX_RELATIVE_RESIDUAL}"
+    if not fit.relative_residual <= SUBMODEL_AGREEMENT:
+        return f"median residual is {fit.relative_residual:.3f} of the depth, at most {SUBMODEL_AGREEMENT}"
     if fit.num_correspondences < MIN_SHARED_TRACKS:
         return f"{fit.num_correspondences} common points, needed {MIN_SHARED_TRACKS}"
     return _camera_rejection(a, b, fit)
@@ -349,8 +347,8 @@ def _rejection_of_matches(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
 
 def _rejection_of_poses(a: Submodel, b: Submodel, fit: SubmodelFit) -> str:
     """The same for an edge from cameras."""
-    if not fit.relative_residual <= MAX_RELATIVE_RESIDUAL:
-        return f"the centres differ by {fit.relative_residual:.3f} of the depth, at most {MAX_RELATIVE_RESIDUAL}"
+    if not fit.relative_residual <= SUBMODEL_AGREEMENT:
+        return f"the centres differ by {fit.relative_residual:.3f} of the depth, at most {SUBMODEL_AGREEMENT}"
     if fit.inlier_share < MIN_POSE_INLIER_RATIO:
         return f"{fit.inlier_share:.0%} of {fit.num_correspondences} cameras fit, needed {MIN_POSE_INLIER_RATIO:.0%}"
     return _camera_rejection(a, b, fit)

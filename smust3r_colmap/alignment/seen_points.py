@@ -18,6 +18,7 @@ from smust3r_colmap.estimators.robust import CAUCHY, RobustLoss, evenly_chosen
 from smust3r_colmap.estimators.sim3 import consensus_sim3, estimate_sim3, homogeneous, point_distances
 from smust3r_colmap.estimators.sl4 import estimate_sl4
 from smust3r_colmap.geometry.arrays import FloatArray
+from smust3r_colmap.geometry.depth_noise import SUBMODEL_AGREEMENT
 from smust3r_colmap.geometry.groups import TransformGroup
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.transform import Transform
@@ -26,9 +27,6 @@ from smust3r_colmap.products import TransformEstimate
 logger = logging.getLogger(__name__)
 
 
-CONSENSUS_RELATIVE_ERROR = 0.05
-"""Residual over depth that counts as agreement at the start: sound overlaps have medians up to 0.046,
-broken ones from 0.15 (six real image sets)."""
 MIN_THICKNESS_SIGMAS = 5.0
 """Thickness of the points over the noise in its direction, both root mean squares, for more than Sim(3).
 A stretch along it is known to noise / (thickness sqrt(n)) from n independent points; neighbouring
@@ -87,7 +85,7 @@ class _SeenPoints:
         if group == "sl4":
             return estimate_sl4(
                 *arguments,
-                max_error=CONSENSUS_RELATIVE_ERROR * (1.0 if self.loss.redescends else float(np.median(self.depth))),
+                max_error=SUBMODEL_AGREEMENT * (1.0 if self.loss.redescends else float(np.median(self.depth))),
                 seed=self.seed,
                 loss=self.loss,
                 residual_scale=self.residual_scale,
@@ -150,7 +148,7 @@ def align_seen_points(
     depth = np.sqrt(depth_target[usable] * depth_source[usable] * unit)
     start, start_weights = None, weights[usable]
     if loss.redescends:
-        start = consensus_sim3(*points, max_error=CONSENSUS_RELATIVE_ERROR * float(np.median(depth)), seed=seed)
+        start = consensus_sim3(*points, max_error=SUBMODEL_AGREEMENT * float(np.median(depth)), seed=seed)
         start_weights = start_weights * (point_distances(start, *points) <= max_start_error * depth)
     seen = _SeenPoints(
         source=points[0],

@@ -26,6 +26,7 @@ from smust3r_colmap.errors import InputError
 from smust3r_colmap.estimators.robust import weighted_median
 from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
+from smust3r_colmap.geometry.depth_noise import ADJACENT_PIXELS, VIEW_AGREEMENT
 from smust3r_colmap.products import DepthMaps
 
 logger = logging.getLogger(__name__)
@@ -33,9 +34,6 @@ logger = logging.getLogger(__name__)
 FloatMap = npt.NDArray[np.float32]
 AnyFloats = npt.NDArray[np.floating[Any]]
 
-DEPTH_EDGE = 0.03
-"""Neighbouring pixels of a map whose depths differ by more than this part are taken for two surfaces: between
-them nothing is blended. A wall seen at 80 degrees from its normal changes by less than that per pixel."""
 MIN_SCALE_POINTS = 12
 """Sparse points on an image's map from which on it has a scale of its own; the median of fewer is luck."""
 MAX_SCALE_RATIO = 1.5
@@ -46,8 +44,6 @@ MIN_CONFIRMATIONS = 2
 """Views that must confirm it, or all where there are fewer. On an indoor sequence with a depth sensor, pixels
 within 5 % of it were 80 % without the test (75 % of the sensor's pixels covered), 85 % of those that one view
 confirms (66 %), and 88 % of those that two confirm (57 %)."""
-AGREEMENT = 0.02
-"""Relative difference of depth within which a view confirms; twice the usual error of a swept depth."""
 FULL_PARALLAX_DEG = 5.0
 """Median angle at the shared points from which on neighbours count in full; views from nearly the same place
 have the same errors and confirm anything."""
@@ -93,7 +89,7 @@ def depth_of_model(
         undistorted: the same images by id with pinhole cameras; their sizes are those of the result.
         maps: by the names in ``original``; each covers its whole original image.
         consistent: set to 0 what fewer than ``MIN_CONFIRMATIONS`` of the ``CHECK_NEIGHBOURS`` views that share
-            most points found within ``AGREEMENT``.
+            most points found within ``VIEW_AGREEMENT``.
 
     Raises:
         InputError: an undistorted image is not in the original model, or its camera is no pinhole.
@@ -165,7 +161,7 @@ class _DepthLookup:
     """A depth map made ready to be asked at any place.
 
     Inverse depth is interpolated, which on a plane is exact; where the four pixels round the place are not one
-    surface (``DEPTH_EDGE``, or one has no depth) the nearest is taken.
+    surface (``ADJACENT_PIXELS``, or one has no depth) the nearest is taken.
 
     Args:
         depth: (H, W), 0 where there is none.
@@ -220,7 +216,7 @@ def _one_surface(depth: FloatMap) -> npt.NDArray[np.bool_]:
     right_and_below = np.ones((2, 2), np.uint8)
     low = cv2.erode(depth, right_and_below, anchor=(0, 0), borderType=cv2.BORDER_REPLICATE)
     high = cv2.dilate(depth, right_and_below, anchor=(0, 0), borderType=cv2.BORDER_REPLICATE)
-    smooth: npt.NDArray[np.bool_] = (low > 0) & (high <= low * (1 + DEPTH_EDGE))
+    smooth: npt.NDArray[np.bool_] = (low > 0) & (high <= low * (1 + ADJACENT_PIXELS))
     return smooth
 
 
@@ -403,7 +399,7 @@ def _confirmed(depth: FloatMap, view: _View, others: Sequence[tuple[_View, _Dept
         x, y, z_other = z * (matrix @ xy1) + offset[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
             found = z_other * other.inverse_depth(x / z_other, y / z_other)  # 1 where it is as deep there
-        missing -= (found >= 1 / (1 + AGREEMENT)) & (found <= 1 / (1 - AGREEMENT))
+        missing -= (found >= 1 / (1 + VIEW_AGREEMENT)) & (found <= 1 / (1 - VIEW_AGREEMENT))
         left = missing > 0
         unsure, xy1, z, missing = unsure[left], xy1[:, left], z[left], missing[left]
     kept: FloatMap = depth.copy()

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from smust3r_colmap.dense.normals import surface_normals
 from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import CloudStatistics, DenseMaps, PointCloud
@@ -24,8 +25,6 @@ MIN_FILL_RATIO = 0.9
 """The search for the voxel size ends with at least this fraction of ``max_points``."""
 MIN_MULTIVIEW_RATIO = 0.5
 """Voxels seen by one image only are dropped where at least this fraction of the cloud remains."""
-DEPTH_JUMP = 0.1
-"""Neighbours whose depths differ by more than this part belong to two surfaces and give no normal."""
 NO_NORMAL_WEIGHT = 1e-3
 """Weight of the viewing direction where a pixel has no normal: it counts where nothing else does."""
 
@@ -105,8 +104,8 @@ def fuse_points(
 
     Cells start at the median distance of neighbouring pixels and grow until ``max_points`` suffice.
     Cells that one image only saw are dropped where at least half of the cloud stays. Normals come from
-    neighbouring pixels, face the camera, and are averaged; where no pixel of a cell has one (rims,
-    depth jumps) the normal points to the cameras. The result depends on nothing but the arguments.
+    windows of pixels, face the camera, and are averaged; where no pixel of a cell has one (outlines,
+    single pixels) the normal points to the cameras. The result depends on nothing but the arguments.
 
     Memory: about 100 bytes x ``SAMPLES_PER_POINT`` x ``max_points``, and one image's maps.
 
@@ -159,27 +158,6 @@ def fuse_points(
     )
 
 
-def surface_normals(points_cam: FloatArray, rows: IntArray, columns: IntArray) -> FloatArray:
-    """Normals (M, 3) at pixels (M,) of a pointmap (H, W, 3) in the camera frame, facing the camera.
-
-    The cross product of the central differences along both axes, one-sided at the rim. Length 1; a
-    viewing direction of length ``NO_NORMAL_WEIGHT`` where a neighbour is NaN or across a depth jump.
-    """
-    last_row, last_column = points_cam.shape[0] - 1, points_cam.shape[1] - 1
-    left, right = np.maximum(columns - 1, 0), np.minimum(columns + 1, last_column)
-    above, below = np.maximum(rows - 1, 0), np.minimum(rows + 1, last_row)
-    here = points_cam[rows, columns]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        along_x = points_cam[rows, right] - points_cam[rows, left]
-        along_y = points_cam[below, columns] - points_cam[above, columns]
-        normals = _unit(np.cross(along_x, along_y))
-        away = np.einsum("mi,mi->m", normals, here) > 0
-        normals[away] *= -1
-        steps = np.maximum(np.abs(along_x[:, 2]), np.abs(along_y[:, 2]))
-        known = _finite(normals) & (steps <= DEPTH_JUMP * here[:, 2])
-        return np.where(known[:, None], normals, -NO_NORMAL_WEIGHT * _unit(here))
-
-
 def _unit(vectors: FloatArray) -> FloatArray:
     unit: FloatArray = vectors / _lengths(vectors)[..., None]
     return unit
@@ -197,6 +175,17 @@ def _finite(vectors: FloatArray) -> npt.NDArray[np.bool_]:
     return np.asarray(x & y & z)
 
 
+def _normals(points_cam: FloatArray) -> FloatArray:
+    """(H, W, 3) of a pointmap in its camera's axes: length 1, or ``NO_NORMAL_WEIGHT`` towards the camera."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        z = points_cam[..., 2]
+        seen = _finite(points_cam) & (z > 0)
+        normals, determined = surface_normals(
+            np.where(seen, z, 0).astype(np.float32), points_cam[..., :2] / z[..., None]
+        )
+    return np.where(determined[..., None], normals, NO_NORMAL_WEIGHT * normals)
+
+
 def _sampled(
     placed: PlacedSubmodel, maps: DenseMaps, k: int, depth_scale: float, *, min_confidence: float, quota: int
 ) -> _MapSamples:
@@ -211,7 +200,7 @@ def _sampled(
     rows, columns = np.divmod(pixels[np.arange(count) * len(pixels) // max(count, 1)], points_cam.shape[1])
     return _MapSamples(
         points_cam=points_cam[rows, columns],
-        normals_cam=surface_normals(points_cam, rows, columns),
+        normals_cam=_normals(points_cam)[rows, columns],
         rgb=maps.rgb(k)[rows, columns],
         spacing=float(np.median(to_neighbour)) if len(to_neighbour) else np.nan,
         num_pixels=len(pixels),

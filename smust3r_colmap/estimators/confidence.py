@@ -14,13 +14,9 @@ import numpy.typing as npt
 
 from smust3r_colmap.estimators.robust import trimmed_median
 from smust3r_colmap.geometry.arrays import FloatArray
+from smust3r_colmap.geometry.depth_noise import SUBMODEL_AGREEMENT
 
 ConfidenceWeighting = Literal["relative", "paper", "off"]
-
-HALF_CONFIDENCE_DISAGREEMENT = 0.05
-"""Depth difference over depth at which half of the confidence is left, in relative mode: sound overlaps
-have median disagreements up to 0.046, broken ones from 0.15 (six real image sets). The 1 of the
-paper's formula is 1 m, at depths of 2 to 4 m indoors a disagreement of 0.25 to 0.5."""
 
 
 def reweighted(
@@ -38,7 +34,9 @@ def reweighted(
     serves as a weight but not for a fixed threshold.
 
     ``"relative"``: the difference is divided by the depth after both maps were brought to one scale,
-    and the product of the confidences is left out: c' = 1 + w (c - 1), w = 1 / (1 + |d_i - d_j| / (0.05 d)).
+    and the product of the confidences is left out: c' = 1 + w (c - 1), w = 1 / (1 + |d_i - d_j| / (0.05 d)),
+    so that half of the confidence is left at ``SUBMODEL_AGREEMENT``. (The 1 of the paper's formula is 1 m, at
+    depths of 2 to 4 m indoors a disagreement of 0.25 to 0.5.)
     Pixels that agree keep their confidence, pixels that do not fall towards 1, so that c' lies in
     [1, c] and thresholds on a confidence keep their meaning.
 
@@ -68,7 +66,7 @@ def reweighted(
         w = np.divide(c_i * c_j, 1 + np.abs(d_i - d_j), out=np.ones_like(c_i), where=both)  # eq. 1
         return w * c_i, w * c_j
     w = np.ones_like(c_i)
-    w[both] = 1 / (1 + _relative_difference(c_i[both], c_j[both], d_i[both], d_j[both]) / HALF_CONFIDENCE_DISAGREEMENT)
+    w[both] = 1 / (1 + _relative_difference(c_i[both], c_j[both], d_i[both], d_j[both]) / SUBMODEL_AGREEMENT)
     return 1 + w * (c_i - 1), 1 + w * (c_j - 1)
 
 

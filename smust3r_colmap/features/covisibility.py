@@ -23,8 +23,9 @@ SAMPLES_PER_IMAGE = 64
 """Points that stand for what an image sees: an overlap is known to some 6 % then."""
 CELLS = 8
 """The depth that an image sees is kept on a grid of so many cells a side."""
-DEPTH_AGREEMENT = 0.3
-"""A surface within this part of the depth that the other image has there is the same, for stitched models bend."""
+STITCHED_DEPTH_AGREEMENT = 0.3
+"""Relative difference of depth up to which two images of a stitched model see one surface: before the adjustment poses
+differ by more than the noise of depth (``geometry.depth_noise``)."""
 MAX_VIEW_ANGLE_DEG = 50.0
 """SIFT does not match a surface seen from directions that differ by more."""
 MIN_SCORE = 0.1
@@ -175,7 +176,7 @@ def _part_seen(
     row, column, inside = _cell_of(surface, points_cam)
     seen_depth = grid[np.where(inside, row, 0), np.where(inside, column, 0)]
     # Where nothing is known (NaN) the comparison is false, and the sample passes.
-    same = ~(np.abs(points_cam[:, 2] - seen_depth) > DEPTH_AGREEMENT * seen_depth)
+    same = ~(np.abs(points_cam[:, 2] - seen_depth) > STITCHED_DEPTH_AGREEMENT * seen_depth)
     there, here = points - centres[owner], points - centre
     lengths = np.linalg.norm(there, axis=1) * np.linalg.norm(here, axis=1)
     cosine = np.einsum("ij,ij->i", there, here) / np.maximum(lengths, np.finfo(float).tiny)

@@ -34,6 +34,7 @@ from smust3r_colmap.features.patch_alignment import (
 )
 from smust3r_colmap.geometry.arrays import BoolArray, Float32Array, FloatArray, IntArray, Pair, UInt8Array
 from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.geometry.depth_noise import VIEW_AGREEMENT, WINDOW_PIXELS
 from smust3r_colmap.geometry.sim3 import invert_rigid
 
 logger = logging.getLogger(__name__)
@@ -74,7 +75,7 @@ SIGMAS = 3.0
 """Robust standard deviations over a pair that its depths, and its matches from where depth puts them, may be off."""
 LEAST_MISS_PX = 1.5
 """Lower bound of the latter: matches of a pair that is exact are not cut to the width of its rounding."""
-DEPTH_TOLERANCE = (0.02, 0.1)
+DEPTH_TOLERANCE = (VIEW_AGREEMENT, 5 * VIEW_AGREEMENT)
 """Bounds of the former, relative: a pair of exact maps still has rounding at slanted surfaces, and where
 most of a pair disagrees its deviation says nothing."""
 SURFACE_SAMPLES = 5
@@ -82,8 +83,6 @@ SURFACE_SAMPLES = 5
 ROUND_TRIP_MAP_PX = 1.5
 """Pixels of the depth map by which the way there and back may miss its start: what reading depth at
 neighbouring pixels can differ by."""
-SURFACE_JUMP = 0.05
-"""Inverse depths that differ by more than this part belong to another surface."""
 SURFACE_SHARE = 0.6
 """Of the pixels round a corner that must lie on its surface. Less is an outline, whose background moves."""
 
@@ -389,7 +388,7 @@ def _surface_at(view: _View, xy: FloatArray) -> _Surface:
     columns, rows = np.moveaxis(np.where(inside[..., None], pixels, 0), -1, 0)
     values = np.where(inside, view.inverse_depth[rows, columns], np.nan)
     middle = values[:, len(window) // 2, None]
-    same = np.asarray(np.abs(values - middle) < SURFACE_JUMP * middle)
+    same = np.asarray(np.abs(values - middle) < WINDOW_PIXELS * middle)
     enough = np.asarray(same.mean(axis=1) >= SURFACE_SHARE)
 
     terms = np.concatenate([np.ones((*same.shape, 1)), pixels + 0.5 - xy_map[:, None]], axis=-1)[enough]

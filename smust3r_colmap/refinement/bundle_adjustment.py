@@ -278,10 +278,10 @@ def _turn_back(model: pycolmap.Reconstruction, before: FloatArray) -> None:
     if not np.isfinite(after).all():
         return
     old, new = invert_rigid(before)[:, :, 3], invert_rigid(after)[:, :, 3]
-    centres = CentredPairs.of(new, old)
-    by_axes = np.einsum("nki,nkj->ij", before[:, :, :3], after[:, :, :3])
-    old_from_new = nearest_rotation(centres.correlation() / extent_of(old) ** 2 + by_axes)
-    middle = centres.mean_a
+    centres = CentredPairs.of(old, new)
+    by_axes = np.einsum("nki,nkj->ij", after[:, :, :3], before[:, :, :3])
+    old_from_new = nearest_rotation((centres.correlation() / extent_of(old) ** 2 + by_axes).T)
+    middle = centres.mean_b
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(old_from_new), middle - old_from_new @ middle))
 
 

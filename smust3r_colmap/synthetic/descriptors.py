@@ -24,7 +24,8 @@ from smust3r_colmap.synthetic.truth import TrueScene
 POINTS_PER_IMAGE = (6, 8)
 """Rows and columns of the points by which overlap is measured; 48 of them tell it to some percent."""
 SAME_SURFACE_RELATIVE_DEPTH = 0.05
-"""Relative depth difference up to which a point is seen and not hidden."""
+"""Relative depth difference up to which a point is seen and not hidden. Wider than
+``geometry.depth_noise.VISIBILITY``: it is read at the nearest pixel, also across slanted surfaces."""
 ANGLE_SCALE_DEG = 30.0
 """Between two views of a point, at which it counts 1/e: descriptors stand turns of some ten degrees."""
 LOG_DISTANCE_SCALE = 0.7

@@ -24,6 +24,7 @@ from helpers.dense_scenes import (
 from smust3r_colmap.dense import depth_consistency
 from smust3r_colmap.dense.depth_consistency import ModelDepth, depth_of_model, sample_depth
 from smust3r_colmap.errors import InputError
+from smust3r_colmap.geometry.depth_noise import ADJACENT_PIXELS
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +104,7 @@ def depth_by_the_rule(depth: FloatMap, x: float, y: float) -> float:
         return 0.0
     j, i = int(max(x - 0.5, 0)), int(max(y - 0.5, 0))
     four = depth[np.ix_([i, min(i + 1, height - 1)], [j, min(j + 1, width - 1)])].astype(np.float64)
-    if four.min() <= 0 or four.max() > four.min() * (1 + depth_consistency.DEPTH_EDGE):
+    if four.min() <= 0 or four.max() > four.min() * (1 + ADJACENT_PIXELS):
         return float(depth[int(y), int(x)])
     right, down = max(x - 0.5, 0) - j, max(y - 0.5, 0) - i
     return float(1 / (np.array([1 - down, down]) @ (1 / four) @ np.array([1 - right, right])))

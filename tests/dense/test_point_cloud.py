@@ -20,7 +20,7 @@ from helpers.sphere_world import (
 )
 from scipy.spatial.transform import Rotation
 
-from smust3r_colmap.dense.point_cloud import fuse_points, surface_normals
+from smust3r_colmap.dense.point_cloud import fuse_points
 from smust3r_colmap.geometry.affine3 import Affine3
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
@@ -259,34 +259,6 @@ def test_points_need_sensible_arguments() -> None:
         world.points(max_points=0)
     with pytest.raises(ValueError, match="3 submodels and 2 sets of maps"):
         fuse_points(world.placed(), world.dense[:2], world.cameras(), max_points=9, min_confidence=2.0)
-
-
-# ----------------------------------------------------------------------------- normals
-def normals_everywhere(points_cam: FloatArray) -> FloatArray:
-    rows, columns = np.indices(points_cam.shape[:2]).reshape(2, -1)
-    return surface_normals(points_cam, rows, columns).reshape(points_cam.shape)
-
-
-@pytest.mark.parametrize("slope", [-0.5, 0.0, 0.8])
-def test_normals_of_a_plane_are_exact_up_to_the_rim(slope: float) -> None:
-    x, y = np.meshgrid(np.linspace(-0.9, 0.9, 41), np.linspace(-0.9, 0.9, 7))
-    z = 5 / (1 - slope * x)  # the plane z = 5 + slope * X seen along rays (x, y, 1)
-    normals = normals_everywhere(np.stack([x * z, y * z, z], axis=-1))
-    expected = np.array([slope, 0, -1]) / np.hypot(slope, 1)
-    gentle = np.abs(np.gradient(z, axis=1)) < 0.04 * z  # steeper counts as a jump
-    np.testing.assert_allclose(normals[gentle], np.broadcast_to(expected, normals.shape)[gentle], atol=1e-12)
-    assert gentle.mean() > 0.5
-
-
-def test_normals_are_not_invented_across_a_depth_jump_or_a_hole() -> None:
-    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 8), np.linspace(-0.5, 0.5, 8))
-    z = np.where(x < 0, 2.0, 4.0)
-    points = np.stack([x * z, y * z, z], axis=-1)
-    points[0, 0] = np.nan
-    lengths = np.linalg.norm(normals_everywhere(points), axis=-1)
-    np.testing.assert_allclose(lengths[:, 3:5], 1e-3)
-    np.testing.assert_allclose(lengths[[0, 1], [1, 0]], 1e-3)
-    np.testing.assert_allclose(lengths[2:, [0, 1, 6, 7]], 1)
 
 
 # ------------------------------------------------------------------------------- loops

@@ -34,7 +34,7 @@ from PIL import Image
 
 from smust3r_colmap.errors import ImageError, InputError, RunDirectoryError, StorageError
 from smust3r_colmap.exporters import dense_workspace
-from smust3r_colmap.exporters.dense_workspace import DenseReport, normals_of_depth, write_dense_workspace
+from smust3r_colmap.exporters.dense_workspace import DenseReport, write_dense_workspace
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 
 WITHOUT_MAP = "f.png"
@@ -150,43 +150,6 @@ def test_normal_maps_are_those_of_the_surfaces_and_face_the_camera(written: Writ
         angle_deg = np.degrees(np.arccos(np.clip(normals[on_wall] @ towards, -1, 1)))
         assert np.median(angle_deg) < 1
         assert np.percentile(angle_deg, 95) < 10
-
-
-def test_window_sums_are_those_of_every_window_by_itself() -> None:
-    rng = np.random.default_rng(4)
-    inverse = rng.uniform(0.93, 1.07, (11, 9)).astype(np.float32)
-    inverse[rng.random(inverse.shape) < 0.2] = 0
-    found = dense_workspace._window_sums(inverse, inverse > 0)
-    expected = np.zeros((9, 11, 9))
-    for (i, j), middle in np.ndenumerate(inverse):
-        for (k, m), value in np.ndenumerate(inverse):
-            dy, dx, change = k - i, m - j, float(value) - float(middle)
-            in_window = max(abs(dx), abs(dy)) <= dense_workspace.NORMAL_RADIUS_PX
-            if middle > 0 and in_window and abs(change) <= dense_workspace.SAME_SURFACE_RELATIVE_DEPTH * middle:
-                expected[:, i, j] += 1, dx, dy, dx * dx, dx * dy, dy * dy, change, dx * change, dy * change
-    assert 5 < expected[0].mean() < 40
-    np.testing.assert_allclose(found, expected, atol=1e-5)
-
-
-def test_normals_of_noisy_planes_are_right_at_every_slant() -> None:
-    camera = np.array([[140.0, 0, 82], [0, 150, 59], [0, 0, 1]])
-    rays = np.column_stack([pixel_centres(160, 120), np.ones(160 * 120)]) @ np.linalg.inv(camera).T
-    rng = np.random.default_rng(2)
-    for normal in ([0, 0, -1], [0.6, 0.2, -1], [-1.2, 0.5, -1], [0, -1, -0.6]):
-        unit = np.array(normal) / np.linalg.norm(normal)
-        depth = np.where(rays @ unit < -0.2, -1 / (rays @ unit), 0).reshape(120, 160)
-        noisy = (depth * (1 + rng.normal(0, 0.004, depth.shape))).astype(np.float32)
-        found = normals_of_depth(noisy, camera)[noisy > 0]
-        angle_deg = np.degrees(np.arccos(np.clip(found @ unit, -1, 1)))
-        assert 0.1 < np.median(angle_deg) < 6, normal
-
-
-def test_a_pixel_without_neighbours_faces_the_camera() -> None:
-    depth = np.zeros((9, 9), np.float32)
-    depth[4, 7] = 2.0
-    normals = normals_of_depth(depth, np.array([[10.0, 0, 4.5], [0, 10, 4.5], [0, 0, 1]]))
-    np.testing.assert_allclose(normals[4, 7], np.array([-0.3, 0, -1]) / np.hypot(0.3, 1), atol=1e-6)
-    assert np.count_nonzero(normals.any(axis=-1)) == 1
 
 
 # ------------------------------------------------------------------------------ fusion

@@ -35,6 +35,7 @@ from smust3r_colmap.backbones.classical.view_selection import (
 from smust3r_colmap.errors import ImageError
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
+from smust3r_colmap.geometry.depth_noise import ADJACENT_PIXELS, FULL_VIEW_AGREEMENT
 from smust3r_colmap.products import Tracks
 
 logger = logging.getLogger(__name__)
@@ -65,8 +66,6 @@ MIN_SCORE = 0.3
 """NCC below which a pixel gets no depth: untextured, occluded or outside the range."""
 SURE_SCORE = 0.7
 """NCC from which an agreeing view counts in full."""
-AGREEMENT = 0.015
-"""Relative difference of depth within which a view agrees in full; it counts nothing at twice that."""
 NEGLIGIBLE_DISTORTION_PX = 0.25
 """Undistortion that moves no pixel further is left out."""
 
@@ -130,7 +129,7 @@ class ImageDepth:
     Args:
         depth: (H, W) float32 z-depth in segment units, 0 where there is none.
         confidence: (H, W) float32, 1 where nothing is known. Every other view that found the same
-            surface adds up to one: less where its depth differs by more than ``AGREEMENT``, or where
+            surface adds up to one: less where its depth differs by more than ``FULL_VIEW_AGREEMENT``, or where
             the images are unlike (NCC below ``SURE_SCORE``).
         rgb: (H, W, 3) uint8.
     """
@@ -201,7 +200,7 @@ def reconstruct_depth(
 
     for k, camera in enumerate(intrinsics):
         others = [(cameras[j], depths[j]) for j in neighbours[k]]
-        agreement = check_consistency(cameras[k], depths[k], others, tolerance=AGREEMENT)
+        agreement = check_consistency(cameras[k], depths[k], others, tolerance=FULL_VIEW_AGREEMENT)
         quality = np.clip((scores[k] - MIN_SCORE) / (SURE_SCORE - MIN_SCORE), 0.0, 1.0)
         depth, confidence = rectifiers[camera].maps_on_grid(depths[k], 1.0 + agreement * quality)
         yield ImageDepth(depth=depth, confidence=confidence, rgb=rgbs[k])
@@ -320,7 +319,8 @@ class Rectifier:
         x, y = self.view_from_grid
         nearest = _sampled(depth, x, y, interpolation=cv2.INTER_NEAREST)
         smooth = _sampled(depth, x, y)
-        on_surface = np.abs(smooth - nearest) < AGREEMENT * nearest
+        # The nearest pixel is at most half a pixel away.
+        on_surface = np.abs(smooth - nearest) < ADJACENT_PIXELS / 2 * nearest
         moved = _sampled(confidence, x, y, interpolation=cv2.INTER_NEAREST)
         return np.where(on_surface, smooth, nearest), np.maximum(moved, np.float32(1.0))
 

@@ -14,10 +14,8 @@ import numpy.typing as npt
 
 from smust3r_colmap.backbones.must3r.preprocessing import NetworkWindow
 from smust3r_colmap.geometry.arrays import Float32Array, FloatArray, IntArray
+from smust3r_colmap.geometry.depth_noise import ADJACENT_PIXELS
 
-SAME_SURFACE_RATIO = 1.03
-"""Largest ratio of depths among four neighbours of one surface: one at 85 degrees to the line of sight changes by 2 %
-from pixel to pixel at 512 pixels across."""
 LARGEST_CONFIDENCE = float(np.finfo(np.float16).max)
 """Confidences are stored as half floats; an exponential of a network may be infinite."""
 
@@ -82,7 +80,7 @@ def _interpolated(z: FloatArray, confidence: FloatArray, y: FloatArray, x: Float
     blended = (1 - down) * ((1 - right) * corners[0] + right * corners[1]) + down * (
         (1 - right) * corners[2] + right * corners[3]
     )
-    one_surface = (corners.min(axis=0) > 0) & (corners.max(axis=0) <= SAME_SURFACE_RATIO * corners.min(axis=0))
+    one_surface = (corners.min(axis=0) > 0) & (corners.max(axis=0) <= (1 + ADJACENT_PIXELS) * corners.min(axis=0))
     inverse_out = np.where(one_surface, blended, inverse[nearest])
     seen = inverse_out > 0
     depth = np.divide(1.0, inverse_out, out=np.zeros_like(inverse_out), where=seen)

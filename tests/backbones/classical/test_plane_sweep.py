@@ -16,7 +16,6 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.backbones.classical.plane_sweep import (
-    AGREEMENT,
     ImageDepth,
     Rectifier,
     View,
@@ -34,6 +33,7 @@ from smust3r_colmap.backbones.classical.view_selection import (
 from smust3r_colmap.errors import ImageError
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
+from smust3r_colmap.geometry.depth_noise import FULL_VIEW_AGREEMENT
 from smust3r_colmap.products import Tracks
 
 WALL_Z, WALL_SLOPE = 4.0, 0.3  # z = 4 + 0.3 x
@@ -236,7 +236,7 @@ def test_agreement_of_exact_depths_counts_the_views_that_see_the_pixel(shots: li
         camera_of(reference),
         reference.depth.astype(np.float32),
         [(camera_of(other), other.depth.astype(np.float32)) for other in others],
-        tolerance=AGREEMENT,
+        tolerance=FULL_VIEW_AGREEMENT,
     )
     assert len(np.unique(visible)) >= 4
     assert (np.abs(agreement.ravel() - visible) < 0.01).mean() > 0.95
