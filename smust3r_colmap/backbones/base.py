@@ -1,7 +1,7 @@
-"""What every backbone is to the pipeline, and what the pipeline gives it.
+"""The interface between the pipeline and a backbone, which reconstructs every segment alone.
 
-``registry`` finds backbones by name. Those that are networks start from ``feed_forward``, which keeps their
-predictions on disk and turns them into submodels.
+``options`` parses the options of one backbone, ``registry`` finds backbones by name. ``feed_forward`` makes one from a
+network: it keeps predictions on disk and turns them into submodels. The next module to read is ``registry``.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class BackboneResult:
 
 
 class Backbone(Protocol):
-    """Reconstructs every segment of one collection alone; made for the run, and keeps what it finished."""
+    """Reconstructs every segment of one collection alone; made for one run, and stores finished segments there."""
 
     name: str
     metric: bool
@@ -72,7 +72,7 @@ class Backbone(Protocol):
         """
 
     def reconstruct(self, segments: Sequence[Segment], *, with_maps: Collection[int]) -> BackboneResult:
-        """All segments. Geometry that does not come out is recorded in the result, never raised.
+        """All segments. Failed geometry is recorded in the result, never raised.
 
         Args:
             segments: of the run, windows and loops; ``segments[k].index == k``.

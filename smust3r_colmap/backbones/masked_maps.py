@@ -1,8 +1,7 @@
-"""Depth without the pixels that the masks of the images leave out.
+"""Dense maps without the pixels that the masks of the images leave out.
 
-Every backbone gives depth for whole images; whatever is made of it after the backbone (alignment by pointmaps, the
-depth map of an image, the cloud, the dense workspace) sees none where a mask is black. The next module to read is
-``fusion``.
+Every backbone gives depth for whole images. The stages after it (alignment by pointmaps, depth consistency, the point
+cloud, the dense workspace) get no depth where a mask is black. The next module to read is ``alignment.stage``.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ from smust3r_colmap.products import DenseMaps, ImageCollection, ImageMask, Sourc
 from smust3r_colmap.storage.run_directory import key_of
 
 SMALL_MASKS_KEPT = 1024
-"""Masks at the size of the maps, a bit per pixel: 25 KB each at 512 x 384. A mask of 12 megapixels takes a third of a
-second to decode, and every image is asked for four times and more."""
+"""Masks at the size of the maps that are kept in memory, a bit per pixel: 25 KB each at 512 x 384. A mask of 12
+megapixels takes a third of a second to decode, and is needed four times or more."""
 
 
 def without_masked_depth(result: BackboneResult, collection: ImageCollection) -> BackboneResult:
@@ -37,7 +36,7 @@ def without_masked_depth(result: BackboneResult, collection: ImageCollection) ->
 
 @dataclass(frozen=True, kw_only=True)
 class MaskedMaps:
-    """``DenseMaps`` with neither depth nor confidence on masked pixels; a pixel of a map is as its centre in the mask.
+    """``DenseMaps`` without depth and confidence on masked pixels: those whose centre is black in the mask.
 
     Args:
         maps: of one submodel.
@@ -54,7 +53,7 @@ class MaskedMaps:
         """(H, W, 3) in the segment frame, NaN where there is none or the mask is black.
 
         Raises:
-            ImageError: the mask is gone or cannot be read when it is first needed; so do the others.
+            ImageError: the mask cannot be read when it is first needed; the other methods raise it, too.
         """
         pointmap_seg = self.maps.pointmap_seg(k)
         kept = self._kept(k, pointmap_seg.shape[:2])

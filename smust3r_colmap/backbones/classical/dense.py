@@ -1,4 +1,7 @@
-"""Depth maps of one submodel, made in a child process and written as a finished stage."""
+"""Depth maps of one submodel, computed in a child process and written as a finished stage.
+
+The next module to read is ``view_selection``.
+"""
 
 from __future__ import annotations
 

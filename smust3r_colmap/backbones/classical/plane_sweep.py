@@ -48,10 +48,10 @@ SWEEP_NEIGHBOURS = 4
 """Views that a sweep compares with; six are 0.5 % better for half again the time."""
 CHECK_NEIGHBOURS = 8
 """Views that may confirm a depth. Looking one up costs a twentieth of sweeping with it."""
-COARSE_WINDOW = 3
+COARSE_WINDOW_PX = 3
 """Pixels at half resolution. Larger fattens foregrounds (5: 1 % fewer correct pixels indoors, 7: 2 %);
 what a small window cannot tell, semi-global matching can."""
-FINE_WINDOW = 7
+FINE_WINDOW_PX = 7
 """Pixels at full resolution."""
 NOISE_VARIANCE = 1.0
 """Squared grey levels added to every window variance: NCC goes to 0 where there is only noise."""
@@ -62,9 +62,9 @@ PLANE_STEP_PX = 1.0
 nothing for 1.5 times the time: the parabola and the second step do the rest."""
 FINE_STEPS_PX = (-1.2, -0.6, 0.0, 0.6, 1.2)
 """Hypotheses of the second step around the first, in pixels of disparity at full resolution."""
-MIN_SCORE = 0.3
+MIN_NCC = 0.3
 """NCC below which a pixel gets no depth: untextured, occluded or outside the range."""
-SURE_SCORE = 0.7
+FULL_WEIGHT_NCC = 0.7
 """NCC from which an agreeing view counts in full."""
 NEGLIGIBLE_DISTORTION_PX = 0.25
 """Undistortion that moves no pixel further is left out."""
@@ -73,9 +73,9 @@ _COST_SCALE = 100  # an NCC of 0 costs this much, of 1 nothing
 _SMALL_STEP_COST = 8  # semi-global matching: a change by one plane (P1)
 _JUMP_COST = 100  # a change by more (P2) across even grey
 _EDGE_GREY = 8.0  # grey step that halves P2: depth jumps where the image does
-_MIN_WEIGHT = 0.05  # NCC given to a neighbour that fits nowhere, so that it lowers the score
+_MIN_WEIGHT_NCC = 0.05  # NCC given to a neighbour that fits nowhere, so that it lowers the score
 _MAX_TANGENT = 2.5  # rays beyond 68 degrees from the axis are left out of pinhole views
-_MAX_VIEW_GROWTH = 1.5  # longer sides of a pinhole view and its image; wider views get a shorter focal
+_MAX_VIEW_GROWTH_RATIO = 1.5  # longer sides of a pinhole view and its image; wider views get a shorter focal
 _MIN_OWN_POINTS = 20  # an image with fewer sparse points borrows those of the submodel
 _TINY = 1e-6
 
@@ -116,7 +116,7 @@ def interior_of(seen: npt.NDArray[np.bool_]) -> FloatMap:
 
     A window that straddles the border compares with made-up pixels: it scores well but a little off.
     """
-    margin = FINE_WINDOW // 2 + 1
+    margin = FINE_WINDOW_PX // 2 + 1
     kernel = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
     eroded = cv2.erode(seen.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
     return np.asarray(eroded, dtype=np.float32)
@@ -130,7 +130,7 @@ class ImageDepth:
         depth: (H, W) float32 z-depth in segment units, 0 where there is none.
         confidence: (H, W) float32, 1 where nothing is known. Every other view that found the same
             surface adds up to one: less where its depth differs by more than ``FULL_VIEW_AGREEMENT``, or where
-            the images are unlike (NCC below ``SURE_SCORE``).
+            the images are unlike (NCC below ``FULL_WEIGHT_NCC``).
         rgb: (H, W, 3) uint8.
     """
 
@@ -195,13 +195,13 @@ def reconstruct_depth(
         else:
             compared = [views[j] for j in neighbours[k][:SWEEP_NEIGHBOURS]]
             depth, score = sweep_depth(view, compared, inverse_depths=depth_range, planes=planes)
-        depths.append(np.where(score >= MIN_SCORE, depth, np.float32(0.0)))
+        depths.append(np.where(score >= MIN_NCC, depth, np.float32(0.0)))
         scores.append(score)
 
     for k, camera in enumerate(intrinsics):
         others = [(cameras[j], depths[j]) for j in neighbours[k]]
         agreement = check_consistency(cameras[k], depths[k], others, tolerance=FULL_VIEW_AGREEMENT)
-        quality = np.clip((scores[k] - MIN_SCORE) / (SURE_SCORE - MIN_SCORE), 0.0, 1.0)
+        quality = np.clip((scores[k] - MIN_NCC) / (FULL_WEIGHT_NCC - MIN_NCC), 0.0, 1.0)
         depth, confidence = rectifiers[camera].maps_on_grid(depths[k], 1.0 + agreement * quality)
         yield ImageDepth(depth=depth, confidence=confidence, rgb=rgbs[k])
 
@@ -329,7 +329,7 @@ def _enclosing_pinhole(rays_cam: FloatArray, focal_px: float, longer_side: int) 
     """Calibration, width and height of the pinhole image that holds all rays (N, 3) with z = 1."""
     tangents = np.clip(rays_cam[np.isfinite(rays_cam).all(axis=1), :2], -_MAX_TANGENT, _MAX_TANGENT)
     low, high = tangents.min(axis=0), tangents.max(axis=0)
-    focal = min(focal_px, _MAX_VIEW_GROWTH * longer_side / float((high - low).max()))
+    focal = min(focal_px, _MAX_VIEW_GROWTH_RATIO * longer_side / float((high - low).max()))
     width, height = (int(np.ceil(side)) for side in (high - low) * focal)
     calibration = np.array([[focal, 0.0, -low[0] * focal], [0.0, focal, -low[1] * focal], [0.0, 0.0, 1.0]])
     return calibration, max(1, width), max(1, height)
@@ -470,7 +470,7 @@ def _plane_costs(reference: View, neighbours: Sequence[View], hypotheses: FloatA
     corners = np.array([[0, width, 0, width], [0, 0, height, height], [1, 1, 1, 1]], dtype=np.float64)
     transfers = [_transfer(reference.camera, neighbour.camera) for neighbour in neighbours]
     means = [float(neighbour.grey.mean()) for neighbour in neighbours]
-    ncc_with = _WindowNcc(reference.grey, COARSE_WINDOW)
+    ncc_with = _WindowNcc(reference.grey, COARSE_WINDOW_PX)
     costs = np.empty((height, len(hypotheses), width), np.int16)
     warped, lesser = np.empty_like(reference.grey), np.empty_like(reference.grey)
     for i, inverse_depth in enumerate(hypotheses):
@@ -574,7 +574,7 @@ def _refine(
     """
     height, width = reference.grey.shape
     x, y = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
-    ncc_with = _WindowNcc(reference.grey, FINE_WINDOW)
+    ncc_with = _WindowNcc(reference.grey, FINE_WINDOW_PX)
     total = np.zeros((len(steps), height, width), np.float32)
     total_weight = np.zeros((height, width), np.float32)
     for neighbour in neighbours:
@@ -593,7 +593,7 @@ def _refine(
         for i, step in enumerate(steps.astype(np.float32)):
             warped = _sampled(neighbour.grey, x_other + x_rate * step, y_other + y_rate * step)
             scores[i] = ncc_with(warped)
-        weight = np.maximum(scores.max(axis=0), np.float32(_MIN_WEIGHT)) ** 2
+        weight = np.maximum(scores.max(axis=0), np.float32(_MIN_WEIGHT_NCC)) ** 2
         weight *= _sampled(neighbour.interior, x_other, y_other, interpolation=cv2.INTER_NEAREST)
         total += weight * scores
         total_weight += weight

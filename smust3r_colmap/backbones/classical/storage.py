@@ -1,4 +1,4 @@
-"""Mapped segments on disk: arrays as safetensors, facts as JSON."""
+"""Mapped segments on disk: arrays as safetensors, all else as JSON."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ BEST_PARALLAX_DEG = 4.0
 are alike, 10 degrees lose a tenth of the correct pixels."""
 MIN_PARALLAX_DEG = 0.5
 """Below, a tenth of a pixel is about 4 % of the depth at 384 pixels: worse than no depth."""
-MIN_OVERLAP = 0.1
+MIN_OVERLAP_SHARE = 0.1
 """Share of a reference's points that a neighbour must contain."""
 _SPREAD_BELOW, _SPREAD_ABOVE = 0.5, 0.8
 """Standard deviations of log parallax; a wide baseline is the lesser evil."""
@@ -95,7 +95,7 @@ def choose_neighbours(
     in_view = np.isfinite(depths_in_views(cameras, points))
     centres = np.stack([camera.centre_seg for camera in cameras])
     parallax_deg = _parallax_deg(points, centres[reference], centres)
-    usable = in_view.mean(axis=1) >= MIN_OVERLAP
+    usable = in_view.mean(axis=1) >= MIN_OVERLAP_SHARE
     usable &= (in_view & (parallax_deg >= MIN_PARALLAX_DEG)).sum(axis=1) > 0.5 * in_view.sum(axis=1)
     scores = np.where(usable, (_parallax_weight(parallax_deg) * in_view).mean(axis=1), 0.0)
     baselines = centres - centres[reference]

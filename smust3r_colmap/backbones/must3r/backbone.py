@@ -84,14 +84,14 @@ from smust3r_colmap.storage.run_directory import key_of
 GIB = 2**30
 MIN_CONFIDENCE = 1.5
 """Median over an image below which the published viewer does not show its camera."""
-MAX_RESIDUAL = 0.1
-"""Median distance of the two pointmaps of an image over the depth; where it is more, they are not of one scene."""
+MAX_RELATIVE_RESIDUAL = 0.1
+"""Median distance of the two pointmaps of an image over the depth, above which they are inconsistent."""
 ENCODED_AT_ONCE_ON_CARD = 16
 """A processor is as fast with one."""
 MIN_SEEN_SHARE = 0.6
-"""Of an image by its centre crop, below which the user is told; a square keeps 75 %."""
-DOUBTED_SHARE = 0.5
-"""Of the images of a segment that may be unsure or inconsistent before the segment is doubted."""
+"""Of an image in its centre crop, below which the user is warned; a square keeps 75 %."""
+MAX_UNRELIABLE_SHARE = 0.5
+"""Of the images of a segment that may have low confidence or inconsistent pointmaps, before the user is warned."""
 
 
 def make_must3r(context: BackboneContext, options: NoOptions) -> FeedForwardBackbone:
@@ -384,7 +384,7 @@ class Must3rPredictor:
             unregistered=tuple(lost),
             method=f"MUSt3R at {self.settings.network_size} px, {num_keyframes} keyframes",
             notes=tuple(notes),
-            warnings=(*warnings, *_doubts([camera for camera in fitted if isinstance(camera, FittedCamera)])),
+            warnings=(*warnings, *_quality_warnings([camera for camera in fitted if isinstance(camera, FittedCamera)])),
         )
 
     def _cameras(
@@ -422,19 +422,19 @@ def _encoded_at_once(device: torch.device) -> int:
     return ENCODED_AT_ONCE_ON_CARD if device.type == "cuda" else 1
 
 
-def _doubts(cameras: Sequence[FittedCamera]) -> tuple[str, ...]:
+def _quality_warnings(cameras: Sequence[FittedCamera]) -> tuple[str, ...]:
     """Why the geometry of a segment should not be trusted."""
     warnings = []
-    torn = [camera.relative_residual for camera in cameras if camera.relative_residual > MAX_RESIDUAL]
-    if len(torn) > DOUBTED_SHARE * len(cameras):
+    torn = [camera.relative_residual for camera in cameras if camera.relative_residual > MAX_RELATIVE_RESIDUAL]
+    if len(torn) > MAX_UNRELIABLE_SHARE * len(cameras):
         warnings.append(
-            f"the two pointmaps of {len(torn)} of {len(cameras)} images contradict each other by more than "
-            f"{MAX_RESIDUAL:.0%} of the depth ({np.median(torn):.0%} in the median)"
+            f"the two pointmaps of {len(torn)} of {len(cameras)} images differ by more than "
+            f"{MAX_RELATIVE_RESIDUAL:.0%} of the depth ({np.median(torn):.0%} in the median)"
         )
     unsure = [camera.median_confidence for camera in cameras if camera.median_confidence < MIN_CONFIDENCE]
-    if len(unsure) > DOUBTED_SHARE * len(cameras):
+    if len(unsure) > MAX_UNRELIABLE_SHARE * len(cameras):
         warnings.append(
-            f"the network is unsure of {len(unsure)} of {len(cameras)} images (median confidence "
+            f"{len(unsure)} of {len(cameras)} images have a low confidence (median "
             f"{np.median(unsure):.2f}, needed {MIN_CONFIDENCE})"
         )
     return tuple(warnings)
