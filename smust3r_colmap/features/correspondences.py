@@ -1,8 +1,7 @@
-"""Keypoints and matches between images, wherever they come from: the border between the sources of tracks and
-what triangulates them.
+"""Keypoints and matches between images, the input of triangulation.
 
-Sources are ``feature_matches`` (SIFT of the run's database) and ``pointmap_matches`` (no features at all).
-The next module to read is ``pair_selection``.
+Sources are ``guided_verification`` (SIFT of the run's database) and ``pointmap_matching`` (no features).
+The next module to read is ``covisibility``.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from smust3r_colmap.geometry.arrays import Pair
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Correspondences:
-    """Which keypoint of one image is which of another.
+    """Keypoints of images and matches between them.
 
     Args:
         keypoints: by image index into the collection, (K, 2) float32 in pixels of the original image, the
@@ -51,7 +50,7 @@ class Correspondences:
 
 
 def joined(first: Correspondences, second: Correspondences) -> Correspondences:
-    """Both sources as one: the keypoints of ``second`` come after those of ``first`` in every image."""
+    """Both sources together: the keypoints of ``second`` come after those of ``first`` in every image."""
     images = sorted({*first.keypoints, *second.keypoints})
     none = np.empty((0, 2), np.float32)
     keypoints = {i: np.concatenate([first.keypoints.get(i, none), second.keypoints.get(i, none)]) for i in images}

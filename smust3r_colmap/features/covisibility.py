@@ -1,9 +1,8 @@
-"""Which images see the same surface, as the stitched geometry has it.
+"""Image pairs that see the same surface, by the known geometry.
 
-Matching every image with every other costs the square of their number and finds look-alike places.
-Here an image is paired with those that see its own surface: samples of what it sees are projected into
-the others, and must come out inside the image, at the depth that the other sees there.
-The next module to read is ``feature_matches``.
+Matching all pairs costs the square of the number of images and finds look-alike places. Here samples of the surface
+that an image sees are projected into other images. A sample counts if it falls into the image at the depth that is
+seen there. The next module to read is ``matching``.
 """
 
 from __future__ import annotations
@@ -20,18 +19,18 @@ from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 
 SAMPLES_PER_IMAGE = 64
-"""Points that stand for what an image sees: an overlap is known to some 6 % then."""
-CELLS = 8
-"""The depth that an image sees is kept on a grid of so many cells a side."""
+"""Points that represent what an image sees; they give an overlap to about 6 %."""
+GRID_CELLS = 8
+"""Along each side of the grid that holds the depth of an image."""
 STITCHED_DEPTH_AGREEMENT = 0.3
 """Relative difference of depth up to which two images of a stitched model see one surface: before the adjustment poses
 differ by more than the noise of depth (``geometry.depth_noise``)."""
 MAX_VIEW_ANGLE_DEG = 50.0
-"""SIFT does not match a surface seen from directions that differ by more."""
-MIN_SCORE = 0.1
-"""Pairs that share less than this part of what they see are not worth matching."""
-SAME_PLACE = 2
-"""Images this near in order to one that is paired already say little new."""
+"""Between the directions from which two images see a point; SIFT does not match beyond."""
+MIN_COVISIBILITY = 0.1
+"""Pairs with less are not matched."""
+SAME_PLACE_IMAGES = 2
+"""Images this near in order to a partner add little."""
 _VOXELS_PER_DEPTH = 4.0
 
 
@@ -43,7 +42,7 @@ class SeenSurface:
         image: index into the collection.
         cam_from_world: (3, 4) rigid.
         intrinsics: at the original image size.
-        points_world: (S, 3) what the image sees; may be empty, then it is paired with nothing.
+        points_world: (S, 3) what the image sees; if empty, the image gets no pairs.
     """
 
     image: int
@@ -65,13 +64,13 @@ def sample_rows(count: int, wanted: int) -> npt.NDArray[np.int64]:
 def select_pairs(surfaces: Sequence[SeenSurface], *, per_image: int, known: Collection[Pair]) -> tuple[Pair, ...]:
     """New pairs (i < j) of images that see the same surface, at most ``per_image`` chosen for each image.
 
-    The best come first; one that is next in order to a pair that is known or chosen already is passed over,
-    so that the choice reaches the other passes of the camera rather than its own neighbours.
+    The highest covisibility comes first. Images next in order to an existing partner are left out, so that pairs reach
+    other passes of the camera rather than neighbours of neighbours.
 
     Args:
         surfaces: of all images of a model.
-        per_image: how many new pairs an image may choose; others may choose it, too.
-        known: pairs that have been matched already; none of them is returned.
+        per_image: new pairs chosen for an image; it can be chosen by others, too.
+        known: matched pairs, which are not returned.
     """
     scores = covisibility(surfaces)
     images = np.array([surface.image for surface in surfaces], dtype=np.int64)
@@ -90,7 +89,7 @@ def select_pairs(surfaces: Sequence[SeenSurface], *, per_image: int, known: Coll
             other = int(images[column])
             if new == per_image:
                 break
-            if any(other + step in taken for step in range(-SAME_PLACE, SAME_PLACE + 1)):
+            if any(other + step in taken for step in range(-SAME_PLACE_IMAGES, SAME_PLACE_IMAGES + 1)):
                 continue
             taken.add(other)
             chosen.add((min(image, other), max(image, other)))
@@ -99,34 +98,34 @@ def select_pairs(surfaces: Sequence[SeenSurface], *, per_image: int, known: Coll
 
 
 def covisibility(surfaces: Sequence[SeenSurface]) -> csr_array:
-    """(N, N) sparse, symmetric: the geometric mean of the parts that two images see of each other's surface.
+    """(N, N) sparse, symmetric: the geometric mean of the fractions that two images see of each other's surface.
 
-    Entries below ``MIN_SCORE`` and the diagonal are left out. Candidates come from the voxels that two
-    images share, so the cost grows with the number of overlaps, not with the square of the images.
+    Entries below ``MIN_COVISIBILITY`` and the diagonal are left out. Candidates are images with
+    a common voxel, so the cost grows with the number of overlaps, not with the square of the number of images.
     """
     n = len(surfaces)
     sampled = [s.points_world[sample_rows(len(s.points_world), SAMPLES_PER_IMAGE)] for s in surfaces]
     candidates = _sharing_voxels(surfaces, sampled)
     grids = [_depth_grid(surface) for surface in surfaces]
     centres = invert_rigid(np.stack([s.cam_from_world for s in surfaces]))[:, :, 3] if n else np.empty((0, 3))
-    rows, columns, parts = [], [], []
+    rows, columns, fractions = [], [], []
     for j, surface in enumerate(surfaces):
         others = [int(i) for i in candidates.indices[candidates.indptr[j] : candidates.indptr[j + 1]] if i != j]
         if not others:
             continue
-        seen = _part_seen(surface, grids[j], [sampled[i] for i in others], centres[others], centres[j])
+        seen = _fraction_seen(surface, grids[j], [sampled[i] for i in others], centres[others], centres[j])
         rows += others
         columns += [j] * len(others)
-        parts += seen.tolist()
-    one_way = csr_array((np.asarray(parts, dtype=np.float64), (rows, columns)), shape=(n, n))
+        fractions += seen.tolist()
+    one_way = csr_array((np.asarray(fractions, dtype=np.float64), (rows, columns)), shape=(n, n))
     both = one_way.multiply(one_way.T).sqrt().tocsr()
-    both.data[both.data < MIN_SCORE] = 0.0
+    both.data[both.data < MIN_COVISIBILITY] = 0.0
     both.eliminate_zeros()
     return both
 
 
 def _sharing_voxels(surfaces: Sequence[SeenSurface], sampled: Sequence[FloatArray]) -> csr_array:
-    """(N, N) sparse, how many voxels two images share, also counting the voxels next to a sample."""
+    """(N, N) sparse, the number of voxels that two images share, including the voxels next to a sample."""
     depths = [
         np.median(points @ s.cam_from_world[2, :3] + s.cam_from_world[2, 3])
         for s, points in zip(surfaces, sampled, strict=True)
@@ -151,38 +150,41 @@ def _sharing_voxels(surfaces: Sequence[SeenSurface], sampled: Sequence[FloatArra
 
 
 def _depth_grid(surface: SeenSurface) -> FloatArray:
-    """(CELLS, CELLS) median depth of what the image sees, NaN where no sample falls."""
-    grid = np.full((CELLS, CELLS), np.nan)
+    """(GRID_CELLS, GRID_CELLS) median depth of the samples in each cell, NaN without samples."""
+    grid = np.full((GRID_CELLS, GRID_CELLS), np.nan)
     points_cam = _in_camera(surface, surface.points_world)
     row, column, inside = _cell_of(surface, points_cam)
-    for cell in np.unique(row[inside] * CELLS + column[inside]):
-        here = inside & (row * CELLS + column == cell)
-        grid[cell // CELLS, cell % CELLS] = np.median(points_cam[here, 2])
+    for cell in np.unique(row[inside] * GRID_CELLS + column[inside]):
+        here = inside & (row * GRID_CELLS + column == cell)
+        grid[cell // GRID_CELLS, cell % GRID_CELLS] = np.median(points_cam[here, 2])
     return grid
 
 
-def _part_seen(
+def _fraction_seen(
     surface: SeenSurface,
     grid: FloatArray,
     samples: Sequence[FloatArray],
     centres: FloatArray,
     centre: FloatArray,
 ) -> FloatArray:
-    """(K,) part of each other image's samples that this image sees, from a direction not too different."""
+    """(K,) fraction of each other image's samples that this image sees, within ``MAX_VIEW_ANGLE_DEG``.
+
+    The angles are not pycolmap's ``calculate_triangulation_angle``, which takes one point at a time.
+    """
     sizes = np.array([len(points) for points in samples])
     owner = np.repeat(np.arange(len(samples)), sizes)
     points = np.concatenate(samples)
     points_cam = _in_camera(surface, points)
     row, column, inside = _cell_of(surface, points_cam)
     seen_depth = grid[np.where(inside, row, 0), np.where(inside, column, 0)]
-    # Where nothing is known (NaN) the comparison is false, and the sample passes.
+    # False where the depth is unknown (NaN), so the sample counts.
     same = ~(np.abs(points_cam[:, 2] - seen_depth) > STITCHED_DEPTH_AGREEMENT * seen_depth)
     there, here = points - centres[owner], points - centre
     lengths = np.linalg.norm(there, axis=1) * np.linalg.norm(here, axis=1)
     cosine = np.einsum("ij,ij->i", there, here) / np.maximum(lengths, np.finfo(float).tiny)
     good = inside & same & (cosine > np.cos(np.deg2rad(MAX_VIEW_ANGLE_DEG)))
-    part: FloatArray = np.bincount(owner[good], minlength=len(samples)) / np.maximum(sizes, 1)
-    return part
+    fraction: FloatArray = np.bincount(owner[good], minlength=len(samples)) / np.maximum(sizes, 1)
+    return fraction
 
 
 def _in_camera(surface: SeenSurface, points_world: FloatArray) -> FloatArray:
@@ -194,11 +196,11 @@ def _in_camera(surface: SeenSurface, points_world: FloatArray) -> FloatArray:
 def _cell_of(
     surface: SeenSurface, points_cam: FloatArray
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-    """Row and column of the grid cell of each point, and whether it lies in the image at all."""
+    """Row and column of the grid cell of each point, and whether it lies in the image."""
     width, height = surface.intrinsics.width, surface.intrinsics.height
     xy = np.full((len(points_cam), 2), -1.0)
     front = points_cam[:, 2] > 0
     xy[front] = np.nan_to_num(surface.intrinsics.xy_img(points_cam[front]), nan=-1.0)
     inside = front & (xy >= 0).all(axis=1) & (xy[:, 0] < width) & (xy[:, 1] < height)
-    cell = np.where(inside[:, None], xy / (width, height) * CELLS, 0).astype(np.int64)
+    cell = np.where(inside[:, None], xy / (width, height) * GRID_CELLS, 0).astype(np.int64)
     return cell[:, 1], cell[:, 0], inside

@@ -1,10 +1,9 @@
-"""Matches of SIFT features that the stitched geometry consents to.
+"""Guided verification: matches of SIFT features that agree with known poses.
 
-Verification of two views by themselves accepts a pair of look-alike places, and some fifty such pairs
-suffice to fold a walk round a symmetric building. Here a match must lie on the epipolar line of the
-stitched cameras, within a tolerance that covers how far they may be off, and a pair most of whose
-matches do not is refused as a whole. In exchange, pairs with too few matches to be verified alone are of use.
-The next module to read is ``adjustment``.
+Two-view verification accepts pairs of look-alike places, and some fifty such pairs fold a walk around a symmetric
+building. Here a match must lie on the epipolar line of the given cameras, within a tolerance for their error. A pair of
+whose matches fewer than ``MIN_INLIER_FRACTION`` do is rejected as a whole. In return, pairs with too few matches for
+two-view verification can be used. The next module to read is ``pointmap_matching``.
 """
 
 from __future__ import annotations
@@ -24,11 +23,10 @@ from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.geometry.so3 import skew
 
-MIN_CONSENT = 0.4
-"""Part of a pair's verified matches that must agree with the geometry; of look-alike places few do by chance."""
+MIN_INLIER_FRACTION = 0.4
+"""Of a pair's verified matches, that must agree with the geometry; of look-alike places few do by chance."""
 MIN_MATCHES = 8
-"""A pair needs this many; the geometry is known, so they need not prove it."""
-
+"""Of a pair. Its geometry is known, so they need not prove it."""
 MIN_VERIFIED = 15
 """Matches of a pair whose geometry is not known; COLMAP's own limit."""
 
@@ -43,7 +41,7 @@ class View:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MatchedFeatures:
-    """What the run's database holds: by image index keypoints (K, 2), by pair all and the verified matches."""
+    """Of a run: keypoints (K, 2) by image index, and by pair all matches and those of two-view verification."""
 
     keypoints: Mapping[int, npt.NDArray[np.float32]]
     raw: Mapping[Pair, npt.NDArray[np.uint32]]
@@ -51,18 +49,18 @@ class MatchedFeatures:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Consent:
+class VerifiedMatches:
     """Matches that agree with the geometry.
 
     Args:
-        correspondences: those that are kept.
-        refused: pairs with verified matches most of which contradict the geometry, with the part that agrees.
-        num_dropped: matches left out of the pairs that are kept.
+        correspondences: these matches, and all keypoints.
+        unverified: two-view verified pairs that are rejected, with the fraction of their matches that agree.
+        num_outliers: matches discarded from the accepted pairs.
     """
 
     correspondences: Correspondences
-    refused: Mapping[Pair, float]
-    num_dropped: int
+    unverified: Mapping[Pair, float]
+    num_outliers: int
 
 
 def read_matched_features(database: Path, images: Collection[int]) -> MatchedFeatures:
@@ -77,7 +75,7 @@ def read_matched_features(database: Path, images: Collection[int]) -> MatchedFea
 
 
 def _keypoints(database: pycolmap.Database, image: int) -> npt.NDArray[np.float32]:
-    """(K, 2) places; an image that failed has no row in the database, and (0, 0) comes back."""
+    """(K, 2) positions; for an image without a row in the database pycolmap returns (0, 0)."""
     keypoints = np.asarray(database.read_keypoints(image + 1), dtype=np.float32)
     return keypoints[:, :2] if len(keypoints) else np.empty((0, 2), np.float32)
 
@@ -93,68 +91,69 @@ def _by_pair(
     return pairs
 
 
-def ask_consent(features: MatchedFeatures, views: Mapping[int, View], *, tolerance: float) -> Consent:
+def verify_guided(features: MatchedFeatures, views: Mapping[int, View], *, tolerance: float) -> VerifiedMatches:
     """The matches that lie on the epipolar lines of ``views``.
 
-    Verified matches with an image that has no view are kept as they are: they may place it.
+    Verified matches with an image that has no view are kept as they are, because they can register it.
 
     Args:
         features: of the run.
         views: by image index.
-        tolerance: Sampson distance allowed, as a part of the longer image side.
+        tolerance: of the Sampson distance, as a fraction of the longer image side.
     """
-    seen = {i: _SeenRays.of(view, features.keypoints[i]) for i, view in views.items()}
+    rays = {i: _ImageRays.of(view, features.keypoints[i]) for i, view in views.items()}
     kept: dict[Pair, npt.NDArray[np.uint32]] = {}
-    refused: dict[Pair, float] = {}
-    num_dropped = 0
+    unverified: dict[Pair, float] = {}
+    num_outliers = 0
     for pair, raw in features.raw.items():
         verified = features.verified.get(pair)
         if pair[0] not in views or pair[1] not in views:
             if verified is not None and len(verified) >= MIN_VERIFIED:
                 kept[pair] = verified
             continue
-        # What verification left out of a pair is mostly wrong by little, and bends the model.
+        # Matches that two-view verification left out are mostly wrong by little, and bend the model.
         matches = raw if verified is None else verified
-        good = _on_epipolar_lines(pair, matches, seen, tolerance)
-        if verified is not None and good.mean() < MIN_CONSENT:
-            refused[pair] = float(good.mean())
+        good = _on_epipolar_lines(rays[pair[0]], rays[pair[1]], matches, tolerance)
+        if verified is not None and good.mean() < MIN_INLIER_FRACTION:
+            unverified[pair] = float(good.mean())
             continue
-        # Without verification, chance puts a few matches on their lines, but not so many of all.
-        if good.sum() >= MIN_MATCHES and good.mean() >= MIN_CONSENT:
+        # Without two-view verification, a few matches lie on their lines by chance, but a small fraction of all.
+        if good.sum() >= MIN_MATCHES and good.mean() >= MIN_INLIER_FRACTION:
             kept[pair] = matches[good]
-            num_dropped += int((~good).sum())
-    return Consent(
+            num_outliers += int((~good).sum())
+    return VerifiedMatches(
         correspondences=Correspondences(keypoints=features.keypoints, matches=kept),
-        refused=refused,
-        num_dropped=num_dropped,
+        unverified=unverified,
+        num_outliers=num_outliers,
     )
 
 
-def consent_shares(
+def inlier_fractions(
     features: MatchedFeatures, views: Mapping[int, View], *, tolerance: float, min_matches: int
 ) -> dict[Pair, float]:
-    """Which part of a pair's verified matches lies on the epipolar lines of ``views``.
+    """The fraction of each pair's verified matches that lie on the epipolar lines of ``views``.
 
     Args:
         features: of the run.
-        views: by image index; pairs of which one is missing are left out.
-        tolerance: as in ``ask_consent``.
+        views: by image index; pairs with an image that has none are left out.
+        tolerance: as in ``verify_guided``.
         min_matches: pairs with fewer verified matches are left out.
     """
-    seen = {i: _SeenRays.of(view, features.keypoints[i]) for i, view in views.items()}
+    rays = {i: _ImageRays.of(view, features.keypoints[i]) for i, view in views.items()}
     return {
-        pair: float(_on_epipolar_lines(pair, rows, seen, tolerance).mean())
+        pair: float(_on_epipolar_lines(rays[pair[0]], rays[pair[1]], rows, tolerance).mean())
         for pair, rows in features.verified.items()
         if len(rows) >= min_matches and pair[0] in views and pair[1] in views
     }
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _SeenRays:
-    """What an image contributes to all of its pairs.
+class _ImageRays:
+    """What all pairs of an image need of it.
 
     Args:
-        cam_from_world: (3, 4). rays: (K, 3) of its keypoints at depth 1.
+        cam_from_world: (3, 4).
+        rays: (K, 3) of its keypoints at depth 1.
         longer_side: of the image, in focal lengths.
     """
 
@@ -163,7 +162,7 @@ class _SeenRays:
     longer_side: float
 
     @classmethod
-    def of(cls, view: View, keypoints: npt.NDArray[np.float32]) -> _SeenRays:
+    def of(cls, view: View, keypoints: npt.NDArray[np.float32]) -> _ImageRays:
         intrinsics = view.intrinsics
         return cls(
             cam_from_world=view.cam_from_world,
@@ -173,24 +172,20 @@ class _SeenRays:
 
 
 def _on_epipolar_lines(
-    pair: Pair,
-    matches: npt.NDArray[np.uint32],
-    seen: Mapping[int, _SeenRays],
-    tolerance: float,
+    a: _ImageRays, b: _ImageRays, matches: npt.NDArray[np.uint32], tolerance: float
 ) -> npt.NDArray[np.bool_]:
-    """(M,) Sampson distance within the tolerance; for a camera that only turned every direction is a line."""
-    seen_a, seen_b = (seen[index] for index in pair)
-    b_from_world, world_from_a = seen_b.cam_from_world, invert_rigid(seen_a.cam_from_world)
+    """(M,) whether the Sampson distance is within the tolerance; without a baseline, any direction of it is assumed."""
+    b_from_world, world_from_a = b.cam_from_world, invert_rigid(a.cam_from_world)
     rotation = b_from_world[:, :3] @ world_from_a[:, :3]
     translation = b_from_world[:, :3] @ world_from_a[:, 3] + b_from_world[:, 3]
     length = np.linalg.norm(translation)
     direction = translation / length if length > 0 else np.array([1.0, 0.0, 0.0])
     essential = skew(direction) @ rotation
-    a, b = seen_a.rays[matches[:, 0]], seen_b.rays[matches[:, 1]]
-    line_b, line_a = a @ essential.T, b @ essential
-    residual = np.abs(np.einsum("ij,ij->i", b, line_b))
+    rays_a, rays_b = a.rays[matches[:, 0]], b.rays[matches[:, 1]]
+    line_b, line_a = rays_a @ essential.T, rays_b @ essential
+    residual = np.abs(np.einsum("ij,ij->i", rays_b, line_b))
     slope = np.sqrt((line_b[:, :2] ** 2).sum(axis=1) + (line_a[:, :2] ** 2).sum(axis=1))
-    # Both images count alike, whichever comes first: one may be a wide angle, the other a tele lens.
-    limit = tolerance * (seen_a.longer_side + seen_b.longer_side) / 2
-    good: npt.NDArray[np.bool_] = residual <= limit * slope  # NaN rays, where undistortion fails, are not good
+    # The mean, so that the order of the images does not matter: one may be a wide angle, the other a tele lens.
+    limit = tolerance * (a.longer_side + b.longer_side) / 2
+    good: npt.NDArray[np.bool_] = residual <= limit * slope  # false for NaN rays, where undistortion fails
     return good

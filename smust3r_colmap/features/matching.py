@@ -1,7 +1,11 @@
-"""Matching image pairs in child processes, with geometric verification by COLMAP."""
+"""Matching image pairs in a child process, with two-view verification by COLMAP.
+
+The next module to read is ``guided_verification``.
+"""
 
 from __future__ import annotations
 
+import logging
 import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,8 +16,9 @@ import pycolmap
 from smust3r_colmap.colmap.database import internal_name, open_database
 from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.execution.task_pool import TaskFailure, TaskPool
-from smust3r_colmap.features.sift import logger
 from smust3r_colmap.geometry.arrays import Pair
+
+logger = logging.getLogger(__name__)
 
 _PAIRS_PER_THREAD = 100
 
@@ -37,10 +42,10 @@ def match_pairs(
 ) -> frozenset[Pair]:
     """Match and verify every pair that is not in the database yet; each pair once in the run.
 
-    pycolmap writes a pair when it is finished, also one without a match, so what is there is done.
+    pycolmap writes each finished pair, also one without matches, so pairs in the database are done.
 
     Returns:
-        The pairs that are done; the others failed and are tried again at the next start.
+        The finished pairs; the others failed and are tried again at the next start.
     """
     wanted = sorted(set(pairs))
     with open_database(path) as database:

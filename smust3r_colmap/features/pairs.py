@@ -1,4 +1,7 @@
-"""Which images are matched with which."""
+"""Image pairs to be matched, chosen without a model.
+
+The next module to read is ``sift``.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +16,13 @@ from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import Segment, consecutive_runs
 
 MAX_TURN_DEG = 60.0
-"""Of two cameras without points between them: what one sees straight ahead is beyond the edge of the other."""
+"""Between the viewing directions of two cameras; beyond, their images rarely overlap."""
 
 
 def plan_pairs(segment: Segment, *, neighbours: int, exhaustive_below: int) -> tuple[Pair, ...]:
-    """Pairs (i < j) of a window worth matching: all in a small one, else neighbours and doubling steps.
+    """Pairs (i < j) of a window: all of a small one, else neighbours and doubling steps.
 
-    Only inside the segment: a longer reach finds look-alike places and folds the model.
+    Only inside the segment, because more distant pairs find look-alike places and fold the model.
     """
     images = sorted(segment.images)
     if len(images) <= exhaustive_below:
@@ -28,10 +31,10 @@ def plan_pairs(segment: Segment, *, neighbours: int, exhaustive_below: int) -> t
 
 
 def plan_loop_pairs(segment: Segment, descriptors: npt.NDArray[np.float32], *, neighbours: int) -> tuple[Pair, ...]:
-    """Pairs (i < j) of a loop segment: each end like a window, and across the most alike.
+    """Pairs (i < j) of a loop segment: each end like a window, and across the most similar.
 
-    Across, each image is paired with the ``neighbours`` images of the other end whose descriptors are
-    most like its own: half of all pairs, and nine tenths of the verified matches (six loops of two walks).
+    Across, each image is paired with the ``neighbours`` images of the other end with the most similar descriptors:
+    half of all pairs, and nine tenths of the verified matches (six loops of two walks).
 
     Args:
         segment: of kind ``"loop"``. descriptors: (N, D) unit vectors of all images of the collection.
@@ -50,7 +53,7 @@ def plan_loop_pairs(segment: Segment, descriptors: npt.NDArray[np.float32], *, n
 
 
 def _near_pairs(images: Sequence[int], neighbours: int) -> tuple[Pair, ...]:
-    """Each image with its next ``neighbours`` and with those at doubling steps."""
+    """Each image with its next ``neighbours`` and the images at doubling steps."""
     n = len(images)
     doubling = [2**k for k in range(1, n.bit_length()) if neighbours < 2**k < n]
     offsets = [*range(1, min(neighbours + 1, n)), *doubling]
@@ -60,10 +63,10 @@ def _near_pairs(images: Sequence[int], neighbours: int) -> tuple[Pair, ...]:
 def alike_pairs(
     descriptors: npt.NDArray[np.float32], num_posed: int, *, per_image: int, exhaustive_below: int
 ) -> tuple[Pair, ...]:
-    """Pairs (i < j) of each image that is to be placed with those most like it; of few images, with all.
+    """Pairs (i < j) of each image without a pose with the most similar ones; of few images, all.
 
     Args:
-        descriptors: (N, D) unit vectors. num_posed: images from this one on are to be placed.
+        descriptors: (N, D) unit vectors. num_posed: images from this one on have no pose.
         per_image: most similar others of each, with and without a pose.
         exhaustive_below: up to so many images every pair is taken.
     """
@@ -76,7 +79,7 @@ def alike_pairs(
 
 
 def neighbouring_pairs(cam_from_world: FloatArray, *, per_image: int, exhaustive_below: int) -> tuple[Pair, ...]:
-    """Pairs (i < j) of cameras that stand near each other and look the same way; of few images, all.
+    """Pairs (i < j) of cameras with nearby centres and similar viewing directions; of few images, all.
 
     Args:
         cam_from_world: (N, 3, 4).

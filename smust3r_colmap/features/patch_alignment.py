@@ -1,4 +1,7 @@
-"""Aligning image patches to a fraction of a pixel (Lucas and Kanade)."""
+"""Aligning image patches to a fraction of a pixel (Lucas and Kanade).
+
+The next module to read is ``smust3r_colmap.refinement.bundle_adjustment``.
+"""
 
 from __future__ import annotations
 
@@ -10,28 +13,28 @@ import numpy as np
 
 from smust3r_colmap.geometry.arrays import BoolArray, Float32Array, FloatArray, UInt8Array
 
-PATCH_RADIUS = 6
-"""13 x 13 pixels: a corner with some surroundings, and still flat on most surfaces."""
+PATCH_RADIUS_PX = 6
+"""13 x 13 pixels: large enough to locate a corner, small enough to be flat on most surfaces."""
 CAPTURE_PX = 4.0
-"""From how far the alignment of a patch finds home at one level of the pyramid."""
+"""Distance from which the alignment converges at one level of the pyramid."""
 MAX_STRETCH = 2.5
-"""Of a patch between two images, in any direction, and its reciprocal; beyond, one has details the other lacks."""
+"""Of a patch between two images, in any direction, and its reciprocal; beyond, one has details that the other lacks."""
 MIN_CORRELATION = 0.8
-"""Normalised, of two patches that show the same."""
+"""Normalised cross-correlation of two patches of the same surface."""
 ITERATIONS = 8
 """Of the alignment at each level of the pyramid."""
 CONVERGED_PX = 0.02
-"""A patch stops where its step is shorter; one that still makes five times as long ones has not settled."""
-LEAST_TEXTURE = 1e-6
-"""Determinant, of the squared gradients of a patch of length one; below it the patch has one direction at most."""
+"""A patch has converged when its step is shorter; a last step five times as long is accepted."""
+MIN_TEXTURE = 1e-6
+"""Determinant of the gradient matrix of a normalised patch; below it, gradients have one direction at most."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AlignedPatches:
-    """Where K patches of image a lie in image b.
+    """Positions of K patches of image a in image b.
 
     Args:
-        xy_b: (K, 2). correlation: (K,) normalised, -1 where the alignment did not settle within its reach.
+        xy_b: (K, 2). correlation: (K,) normalised, -1 if the alignment did not converge within its reach.
     """
 
     xy_b: FloatArray
@@ -47,46 +50,46 @@ def align_patches(
     *,
     reach_px: float,
 ) -> AlignedPatches:
-    """Shift the warped patches of image a until they fit image b, whatever the brightness and the contrast.
+    """Shift the warped patches of image a until they fit image b, invariant to brightness and contrast.
 
-    From the coarsest level that the reach asks for, and both pyramids have, to the finest, by Gauss-Newton
-    with the gradients of the template; a level that fits worse where it ends than where it began is not
-    believed. Patches without texture correlate with nothing.
+    Gauss-Newton with the gradients of the template, from the coarsest level that the reach requires, and both pyramids
+    have, to the finest. A level that ends with a lower correlation is ignored. Patches without texture have correlation
+    0.
 
     Args:
         pyramid_a, pyramid_b: (H, W) uint8 and its halves by ``cv2.pyrDown``.
         xy_a: (K, 2) centres of the patches in image a.
-        xy_b: (K, 2) first guesses in image b.
-        b_from_a: (K, 2, 2) how a patch lies in image b, invertible.
-        reach_px: largest distance from the first guess.
+        xy_b: (K, 2) initial positions in image b.
+        b_from_a: (K, 2, 2) warps of the patches, invertible.
+        reach_px: largest distance from the initial position.
 
     Source: Baker and Matthews 2004, "Lucas-Kanade 20 Years On", inverse compositional, for a translation.
     """
     xy = xy_b.copy()
     correlation = np.full(len(xy), -1.0)
-    settled = np.zeros(len(xy), dtype=bool)
+    converged = np.zeros(len(xy), dtype=bool)
     for level in reversed(range(min(num_levels(reach_px), len(pyramid_a), len(pyramid_b)))):
-        # The centre of a first pixel is that of the next level's, and (0.5, 0.5) at every level.
+        # The centre of the first pixel is (0.5, 0.5) at every level.
         template = _Template.cut(pyramid_a[level], (xy_a - 0.5) / 2**level, b_from_a)
-        end, correlation, settled = template.laid_on(pyramid_b[level], (xy - 0.5) / 2**level)
+        end, correlation, converged = template.align_to(pyramid_b[level], (xy - 0.5) / 2**level)
         xy = end * 2**level + 0.5
-    within = settled & (np.linalg.norm(xy - xy_b, axis=1) <= reach_px)
+    within = converged & (np.linalg.norm(xy - xy_b, axis=1) <= reach_px)
     return AlignedPatches(xy_b=xy, correlation=np.where(within, correlation, -1.0))
 
 
 def num_levels(reach_px: float) -> int:
-    """Of a pyramid in whose coarsest image a reach is within ``CAPTURE_PX``; at least one."""
+    """Of a pyramid whose coarsest level has the reach within ``CAPTURE_PX``; at least 1."""
     return 1 + max(0, int(np.ceil(np.log2(reach_px / CAPTURE_PX))))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Template:
-    """K patches of P pixels, and how they change when they are shifted over image b.
+    """K patches of P pixels, and their derivatives by a shift in image b.
 
     Args:
         values: (K, P) of mean zero and length one; zero for a patch without texture.
         offsets: (K, P, 2) of the pixels in image b.
-        descent: (K, 2, P) the shift that a difference in values asks for.
+        descent: (K, 2, P) Gauss-Newton shift by a difference in values.
     """
 
     values: Float32Array
@@ -96,27 +99,27 @@ class _Template:
     @classmethod
     def cut(cls, image: UInt8Array, xy: FloatArray, b_from_a: FloatArray) -> _Template:
         """At (K, 2), where the centre of the first pixel is (0, 0)."""
-        side = 2 * PATCH_RADIUS + 1
-        wide = _sampled(image, xy, _window(PATCH_RADIUS + 1)[None]).reshape(-1, side + 2, side + 2)
+        side = 2 * PATCH_RADIUS_PX + 1
+        wide = _sampled(image, xy, _window(PATCH_RADIUS_PX + 1)[None]).reshape(-1, side + 2, side + 2)
         values, length = _normalised(wide[:, 1:-1, 1:-1].reshape(-1, side**2))
         along_x = (wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]) / 2
         along_y = (wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]) / 2
         gradient_a = np.stack([along_x, along_y], axis=1).reshape(-1, 2, side**2) / length[:, None]
         gradient = np.swapaxes(np.linalg.inv(b_from_a), 1, 2).astype(np.float32) @ gradient_a
-        # Values are normalised, so what changes their mean or length alone is no change.
+        # Values are normalised, so changes of their mean or length have no effect.
         gradient -= gradient.mean(axis=2, keepdims=True)
         gradient -= (gradient @ values[:, :, None]) * values[:, None]
         hessian = gradient @ np.swapaxes(gradient, 1, 2)
-        textured = np.asarray(np.linalg.det(hessian) > LEAST_TEXTURE)
+        textured = np.asarray(np.linalg.det(hessian) > MIN_TEXTURE)
         hessian[~textured] = np.eye(2)
         return cls(
             values=np.where(textured[:, None], values, 0),
-            offsets=_window(PATCH_RADIUS) @ np.swapaxes(b_from_a, 1, 2).astype(np.float32),
+            offsets=_window(PATCH_RADIUS_PX) @ np.swapaxes(b_from_a, 1, 2).astype(np.float32),
             descent=(np.linalg.inv(hessian) @ gradient).astype(np.float32),
         )
 
-    def laid_on(self, image: UInt8Array, begin: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Where (K, 2) the patches fit best from (K, 2) on, their correlation there (K,), and whether it settled."""
+    def align_to(self, image: UInt8Array, begin: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """The best positions (K, 2) from (K, 2) on, the correlation (K,) there, and whether it has converged."""
         xy, step = begin.copy(), np.zeros(len(begin))
         correlation = self._correlation(image, begin)
         moving = np.arange(len(begin))
@@ -128,8 +131,8 @@ class _Template:
             moving = moving[step[moving] > CONVERGED_PX]
         end = self._correlation(image, xy)
         better = end >= correlation
-        settled = step <= 5 * CONVERGED_PX
-        return np.where(better[:, None], xy, begin), np.where(better, end, correlation), settled
+        converged = step <= 5 * CONVERGED_PX
+        return np.where(better[:, None], xy, begin), np.where(better, end, correlation), converged
 
     def _correlation(self, image: UInt8Array, xy: FloatArray) -> FloatArray:
         values, _ = _normalised(_sampled(image, xy, self.offsets))
@@ -143,7 +146,7 @@ def _window(radius: int) -> Float32Array:
 
 
 def _sampled(image: UInt8Array, xy: FloatArray, offsets: Float32Array) -> Float32Array:
-    """(K, P) grey levels at (K, 2) and offsets (K or 1, P, 2); beyond the border it goes on."""
+    """(K, P) grey levels at (K, 2) and offsets (K or 1, P, 2); the border is replicated."""
     if not len(xy):
         return np.empty((0, offsets.shape[1]), np.float32)
     at = xy.astype(np.float32)[:, None] + offsets

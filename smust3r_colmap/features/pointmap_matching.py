@@ -1,13 +1,12 @@
-"""Tracks without features: corners carried from image to image by depth and cameras, then placed by the pixels.
+"""Tracks without features: corners are transferred between images by depth and cameras, then located by their pixels.
 
-Depth maps and stitched cameras are right to some pixels. A match that repeats them teaches a bundle
-adjustment nothing, so they only say where to look, at what warp and with what right: a corner is carried
-over where both images' depths agree on its surface, and is then laid on the other image by its patch. What
-that image contradicts is dropped.
+Depth maps and initial cameras are right to some pixels. A match that only repeats them adds nothing to a bundle
+adjustment, so they only give a position and a warp to start from. A corner is transferred where both images' depths
+agree on its surface, and its patch is then aligned to the other image. Patches that do not fit are discarded.
 
-A track is one corner. Where it was detected it has no error, everywhere else it is what was laid on it, and
-what was found once is carried on to the next images rather than detected again: that makes tracks long.
-Coordinates are pixels of the grey image until they are returned. The next module to read is ``adjustment``.
+A track is one corner. It is exact where it was detected; in all other images it is an aligned position. Keypoints that
+were found are transferred to the next images instead of detecting new ones, which makes tracks long.
+Coordinates are pixels of the grey image until they are returned. The next module to read is ``patch_alignment``.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from smust3r_colmap.features.correspondences import Correspondences
 from smust3r_colmap.features.patch_alignment import (
     MAX_STRETCH,
     MIN_CORRELATION,
-    PATCH_RADIUS,
+    PATCH_RADIUS_PX,
     align_patches,
     num_levels,
 )
@@ -39,61 +38,59 @@ from smust3r_colmap.geometry.sim3 import invert_rigid
 
 logger = logging.getLogger(__name__)
 
-
 CACHED_VIEWS = 32
-"""Images in memory at a time, at 4/3 bytes a pixel; more than an image has partners as a rule, so that going
-through a sequence reads each image once."""
-CANDIDATES = 4
-"""Corners that are looked at per corner wanted, for some lie on no surface."""
-ARRIVALS = 2
-"""Times the corners of its own that an image may have, with what later images find in it."""
-MOST_KEYPOINTS = 16_000
-"""That an image may be given; OpenCV's remap takes twice that many patches at once and no more."""
-MOST_PIXELS = 32_766
-"""Along a side of a grey image, for the same reason."""
-WIDE_REACH = 0.04
-"""How far from where the stitched cameras put a corner it is looked for, as a part of the longer side: 26 px of
-640. Two cameras 5 cm and half a degree apart from where they should be move what is 2 m away by 20."""
-NEAR_REACH = 0.01
-"""The same once the two images have agreed on how they stand to each other; what is left comes from depth."""
-SAMPLE = 200
-"""Corners that an agreement is made of."""
-MIN_AGREEING = 15
-"""Corners that must support it; COLMAP wants as many inliers of a pair."""
-MIN_AGREEING_SHARE = 0.4
-"""Of the corners that were found: look-alike surfaces correlate here and there, but to no common motion."""
-CORNER_BLOCK = 5
-"""Side of the window whose gradients make a corner."""
-CORNER_DISTANCE = 4
-"""Pixels that two corners of an image are apart at least; nearer ones share most of their patch."""
+"""Images in memory at a time, at 4/3 bytes a pixel; more than the partners of most images, so that a sequence reads
+each image once."""
+CANDIDATES_PER_CORNER = 4
+"""Corners that are examined for each one needed, because some lie on no surface."""
+MAX_KEYPOINTS_FACTOR = 2
+"""On the number of corners of an image: the limit of its keypoints, with those transferred from other images."""
+KEYPOINTS_LIMIT = 16_000
+"""Of an image; OpenCV's remap takes at most twice as many patches at once."""
+MAX_SIDE_PX = 32_766
+"""Of a grey image, for the same reason."""
+WIDE_SEARCH_FRACTION = 0.04
+"""Search radius around the position by the initial cameras, as a fraction of the longer side: 26 px of 640. Cameras
+that are off by 5 cm and half a degree move a point at 2 m by 20 px."""
+NARROW_SEARCH_FRACTION = 0.01
+"""The same once the relative pose of the two images is estimated; the rest is the error of depth."""
+SAMPLE_CORNERS = 200
+"""From which a relative pose is estimated."""
+MIN_POSE_INLIERS = 15
+"""Corners that must support it; COLMAP's minimum of a pair."""
+MIN_POSE_INLIER_FRACTION = 0.4
+"""Of the corners that were found: look-alike surfaces correlate here and there, without a common motion."""
+CORNER_WINDOW_PX = 5
+"""Side of the window of gradients of a corner."""
+MIN_CORNER_DISTANCE_PX = 4
+"""Between corners of an image; nearer ones share most of their patch."""
 MIN_GRADIENT = 2.0
-"""Grey levels per pixel (rms over the window) along the weaker direction of a corner. Noise and JPEG make about
-one; from two on, a patch is placed to a tenth of a pixel."""
+"""Grey levels per pixel (rms over the window) along the weaker direction of a corner. Noise and JPEG give about 1; from
+2 on, a patch is located to a tenth of a pixel."""
 MERGE_PX = 0.75
-"""What is found nearer than this to a keypoint is that keypoint."""
-SIGMAS = 3.0
-"""Robust standard deviations over a pair that its depths, and its matches from where depth puts them, may be off."""
-LEAST_MISS_PX = 1.5
-"""Lower bound of the latter: matches of a pair that is exact are not cut to the width of its rounding."""
-DEPTH_TOLERANCE = (VIEW_AGREEMENT, 5 * VIEW_AGREEMENT)
-"""Bounds of the former, relative: a pair of exact maps still has rounding at slanted surfaces, and where
-most of a pair disagrees its deviation says nothing."""
+"""Positions nearer than this to a keypoint are this keypoint."""
+MAX_SIGMAS = 3.0
+"""Robust standard deviations of a pair, within which its depths agree, and its matches agree with its depths."""
+MIN_REPROJECTION_TOLERANCE_PX = 1.5
+"""Lower limit of the latter: matches of an exact pair are not limited to its rounding errors."""
+DEPTH_TOLERANCE_RANGE = (VIEW_AGREEMENT, 5 * VIEW_AGREEMENT)
+"""Limits of the former, relative: exact maps still differ by rounding at slanted surfaces, and where most of a pair
+disagrees, the deviation says nothing."""
 SURFACE_SAMPLES = 5
-"""Along each side of a patch that a plane is fitted to: 25 make its slope good enough for a warp."""
-ROUND_TRIP_MAP_PX = 1.5
-"""Pixels of the depth map by which the way there and back may miss its start: what reading depth at
-neighbouring pixels can differ by."""
-SURFACE_SHARE = 0.6
-"""Of the pixels round a corner that must lie on its surface. Less is an outline, whose background moves."""
+"""Along each side of a patch, that a plane is fitted to: 25 give a slope that is good enough for a warp."""
+MAX_ROUND_TRIP_MAP_PX = 1.5
+"""Distance in pixels of the depth map after a transfer there and back; neighbouring pixels differ by as much."""
+MIN_SURFACE_FRACTION = 0.6
+"""Of the pixels around a corner, that must lie on its surface; with less it is an occluding edge."""
 
 
 # -------------------------------------------------------------------------------- input
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MappedView:
-    """An image with its camera and what reads its pixels and its depth.
+    """An image with its camera, and functions that read its pixels and its depth.
 
-    The three arrays cover the whole (distorted) image, each uniformly resized; corners are located in
-    the grey one, so its size is the caller's choice of exactness against time.
+    The three arrays cover the whole (distorted) image, each uniformly resized. Corners are located in the grey one, so
+    its size is a choice between accuracy and time.
 
     Args:
         index: of the image in the collection.
@@ -121,14 +118,14 @@ class MappedView:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Camera:
-    """Where a view stands and how it projects, at the size of its grey image."""
+    """Pose and intrinsics of a view, at the size of its grey image."""
 
     cam_from_world: FloatArray  # (3, 4)
     intrinsics: Intrinsics
 
-    def reach_px(self, share: float) -> float:
-        """A part of the longer side."""
-        return share * max(self.intrinsics.width, self.intrinsics.height)
+    def fraction_px(self, fraction: float) -> float:
+        """A fraction of the longer side in pixels."""
+        return fraction * max(self.intrinsics.width, self.intrinsics.height)
 
     def xy_img(self, points_world: FloatArray) -> FloatArray:
         """(K, 2) of points (K, 3); NaN behind the camera."""
@@ -147,15 +144,17 @@ class _Camera:
         return z
 
     def sees(self, points_world: FloatArray, xy_img: FloatArray) -> BoolArray:
-        """(K,) whether points (K, 3) are seen at (K, 2), but for what most of them are off."""
-        return _usual(
-            np.linalg.norm(self.xy_img(points_world) - xy_img, axis=1), LEAST_MISS_PX, self.reach_px(NEAR_REACH)
+        """(K,) whether points (K, 3) are seen at (K, 2), within the typical error of these points."""
+        return _within_typical_error(
+            np.linalg.norm(self.xy_img(points_world) - xy_img, axis=1),
+            MIN_REPROJECTION_TOLERANCE_PX,
+            self.fraction_px(NARROW_SEARCH_FRACTION),
         )
 
     def holds(self, xy_img: FloatArray) -> BoolArray:
         """(K,) whether the patch at (K, 2) lies within the image; false where a coordinate is NaN."""
         size = np.array([self.intrinsics.width, self.intrinsics.height])
-        margin = PATCH_RADIUS + 1
+        margin = PATCH_RADIUS_PX + 1
         inside: BoolArray = np.all((xy_img >= margin) & (xy_img <= size - margin), axis=1)
         return inside
 
@@ -183,19 +182,19 @@ class _View:
         return np.array([width / self.camera.intrinsics.width, height / self.camera.intrinsics.height])
 
 
-def _usual(sizes: FloatArray, least: float, most: float) -> BoolArray:
-    """(K,) which of the sizes of errors (K,) are within ``SIGMAS`` robust standard deviations, bounded both ways."""
-    finite = sizes[np.isfinite(sizes)]
+def _within_typical_error(errors: FloatArray, least: float, most: float) -> BoolArray:
+    """(K,) which errors (K,) are within ``MAX_SIGMAS`` robust standard deviations, from ``least`` to ``most``."""
+    finite = errors[np.isfinite(errors)]
     sigma = MAD_TO_SIGMA * np.median(finite) if len(finite) else 0.0
-    return np.asarray(sizes <= np.clip(SIGMAS * sigma, least, most))
+    return np.asarray(errors <= np.clip(MAX_SIGMAS * sigma, least, most))
 
 
 def _read(view: MappedView, min_confidence: float) -> _View:
     grey, depth, confidence = view.grey(), view.depth(), view.confidence()
     if grey.ndim != 2 or grey.dtype != np.uint8:
         raise ValueError(f"image {view.index}: grey is {grey.shape} {grey.dtype}, needed (H, W) uint8")
-    if max(grey.shape) > MOST_PIXELS:
-        raise ValueError(f"image {view.index}: grey is {grey.shape}, at most {MOST_PIXELS} a side; give it resized")
+    if max(grey.shape) > MAX_SIDE_PX:
+        raise ValueError(f"image {view.index}: grey is {grey.shape}, at most {MAX_SIDE_PX} a side; give it resized")
     if depth.ndim != 2 or depth.shape != confidence.shape:
         raise ValueError(
             f"image {view.index}: depth is {depth.shape}, confidence {confidence.shape}, needed one (h, w)"
@@ -204,7 +203,10 @@ def _read(view: MappedView, min_confidence: float) -> _View:
     height, width = grey.shape
     camera = _Camera(cam_from_world=view.cam_from_world, intrinsics=view.intrinsics.resized(width, height))
     pyramid = [grey]
-    while len(pyramid) < num_levels(camera.reach_px(WIDE_REACH)) and min(pyramid[-1].shape) > 4 * PATCH_RADIUS:
+    while (
+        len(pyramid) < num_levels(camera.fraction_px(WIDE_SEARCH_FRACTION))
+        and min(pyramid[-1].shape) > 4 * PATCH_RADIUS_PX
+    ):
         pyramid.append(np.asarray(cv2.pyrDown(pyramid[-1]), dtype=np.uint8))
     return _View(
         index=view.index,
@@ -220,32 +222,33 @@ def match_by_pointmaps(
 ) -> Correspondences:
     """Mutual, depth-consistent correspondences between images, located by their pixels.
 
-    Images are gone through in order. Each gets corners where it has no keypoint yet, and all its keypoints
-    are looked for in every image that it forms a pair with and that has not got them:
+    Images are visited in order. Each gets corners where it has no keypoint yet. All its keypoints are searched in every
+    image that it forms a pair with and that does not have them:
 
-    - how the two images stand to each other is agreed first, within ``WIDE_REACH`` of what the stitched cameras
-      say (``_agreed_camera``); a pair that does not agree gets no matches;
-    - depth says where: the other image must have the same depth there, within ``SIGMAS`` deviations of the
-      pair and ``DEPTH_TOLERANCE``, and its own depth must lead back to within ``ROUND_TRIP_MAP_PX``;
-    - the patch, warped by the surface's slope, is laid on the other image (``align_patches``); it must correlate by
-      ``MIN_CORRELATION``, and lie where depth put it as nearly as most of the pair do and within ``NEAR_REACH``;
-    - what comes within ``MERGE_PX`` of a keypoint is that keypoint, and two tracks become one.
+    - The relative pose of the two images is estimated, within ``WIDE_SEARCH_FRACTION`` of the initial cameras
+      (``_estimated_camera``); without enough inliers the pair gets no matches.
+    - Depth gives the position. The other image must have the same depth there, within ``MAX_SIGMAS`` deviations of the
+      pair and ``DEPTH_TOLERANCE_RANGE``, and its own depth must lead back to within ``MAX_ROUND_TRIP_MAP_PX``.
+    - The patch, warped by the slope of the surface, is aligned to the other image (``align_patches``). Its correlation
+      must reach ``MIN_CORRELATION``, and its position must agree with depth as for most of the pair and within
+      ``NARROW_SEARCH_FRACTION``.
+    - A position within ``MERGE_PX`` of a keypoint is this keypoint, and two tracks become one.
 
-    In the end a pair is matched wherever both images have a keypoint of one track, and each image's depth puts
-    it where the other has it; a keypoint is matched once at most. At most ``CACHED_VIEWS`` images are in memory.
+    In the end a pair is matched wherever both images have a keypoint of one track, and each image's depth gives its
+    position in the other; a keypoint is matched once at most. At most ``CACHED_VIEWS`` images are in memory.
 
     Args:
         views: images by distinct index.
         pairs: (i, j) of image indices with i < j; only these are compared and matched. Repeats count once.
-        max_keypoints: with which an image begins; others may find as many again in it.
+        max_keypoints: corners of an image; as many can be transferred from others.
         min_confidence: of depth that is used; 1 is none.
 
     Returns:
-        Keypoints of all views, without those that match nothing, and matches of the pairs that have any.
+        Keypoints of all views, without unmatched ones, and matches of the pairs that have any.
 
     Raises:
         ValueError: two views have one index, a pair is not ascending or names no view, ``max_keypoints`` is not
-            within 1 to ``MOST_KEYPOINTS``, or what a loader gives has another shape or type than stated.
+            within 1 to ``KEYPOINTS_LIMIT``, or an array has another shape or type than stated.
     """
     view_of = _by_index(views, pairs, max_keypoints)
     partners = defaultdict(set)
@@ -253,14 +256,14 @@ def match_by_pointmaps(
         partners[i].add(j)
         partners[j].add(i)
     read = lru_cache(maxsize=CACHED_VIEWS)(lambda index: _read(view_of[index], min_confidence))
-    tracks = _Tracks(ARRIVALS * max_keypoints)
+    tracks = _Tracks(MAX_KEYPOINTS_FACTOR * max_keypoints)
     px_per_grey_px = {index: np.ones(2) for index in view_of}
     for i in sorted(partners):
         view = read(i)
         px_per_grey_px[i] = np.divide(_size(view_of[i].intrinsics), _size(view.camera.intrinsics))
         tracks.start(view, _new_corners(view, tracks.of(i).xy, max_keypoints))
         for j in sorted(partners[i]):
-            _carry_over(tracks, view, read(j))
+            _transfer_tracks(tracks, view, read(j))
     found = _correspondences(tracks, px_per_grey_px, sorted(set(pairs)))
     logger.info("%d matches of %d pairs by pointmaps", found.num_matches, len(found.matches))
     return found
@@ -273,8 +276,8 @@ def _by_index(views: Sequence[MappedView], pairs: Sequence[Pair], max_keypoints:
     for i, j in pairs:
         if not i < j or i not in view_of or j not in view_of:
             raise ValueError(f"match_by_pointmaps: pair ({i}, {j}) is not ascending or names no view")
-    if not 1 <= max_keypoints <= MOST_KEYPOINTS:
-        raise ValueError(f"match_by_pointmaps: max_keypoints is {max_keypoints}, needed 1 to {MOST_KEYPOINTS}")
+    if not 1 <= max_keypoints <= KEYPOINTS_LIMIT:
+        raise ValueError(f"match_by_pointmaps: max_keypoints is {max_keypoints}, needed 1 to {KEYPOINTS_LIMIT}")
     return view_of
 
 
@@ -285,7 +288,7 @@ def _size(intrinsics: Intrinsics) -> tuple[int, int]:
 def _correspondences(
     tracks: _Tracks, px_per_grey_px: Mapping[int, FloatArray], pairs: Sequence[Pair]
 ) -> Correspondences:
-    """What is matched, with the keypoints that are, numbered anew and at the size of the intrinsics."""
+    """The matches, and their keypoints at the size of the intrinsics."""
     matches = {(i, j): tracks.matched(i, j) for i, j in pairs}
     matches = {pair: rows for pair, rows in matches.items() if len(rows)}
     used = {index: np.zeros(len(tracks.of(index)), dtype=bool) for index in px_per_grey_px}
@@ -307,16 +310,16 @@ def _correspondences(
 
 # ------------------------------------------------------------------------------- corners
 def _new_corners(view: _View, known_xy: FloatArray, max_keypoints: int) -> FloatArray:
-    """(K, 2) centres of pixels that are corners on a surface, away from the keypoints (M, 2) that are there.
+    """(K, 2) centres of pixels that are corners on a surface, away from the known keypoints (M, 2).
 
-    So many that the image has ``max_keypoints``, or all there are.
+    At most so many that the image has ``max_keypoints``.
     """
     wanted = max(0, max_keypoints - len(known_xy))
     strength = _corner_strength(view.pyramid[0])
-    around = np.ones((2 * CORNER_DISTANCE - 1, 2 * CORNER_DISTANCE - 1), np.uint8)
+    around = np.ones((2 * MIN_CORNER_DISTANCE_PX - 1, 2 * MIN_CORNER_DISTANCE_PX - 1), np.uint8)
     peaks = (strength >= np.maximum(cv2.dilate(strength, around), MIN_GRADIENT**2)).astype(np.uint8)
     for x, y in known_xy:
-        cv2.circle(peaks, (int(x), int(y)), CORNER_DISTANCE, 0, thickness=-1)
+        cv2.circle(peaks, (int(x), int(y)), MIN_CORNER_DISTANCE_PX, 0, thickness=-1)
     rows, columns = np.nonzero(peaks)
     xy: FloatArray = np.stack([columns, rows], axis=1).astype(np.float64) + 0.5
     map_columns, map_rows = (xy * view.map_px_per_px).astype(np.int64).T
@@ -324,19 +327,21 @@ def _new_corners(view: _View, known_xy: FloatArray, max_keypoints: int) -> Float
     xy = xy[usable]
 
     cell_side = np.sqrt(strength.size / max_keypoints)
-    spread = xy[_evenly_ordered(xy, strength[rows, columns][usable], known_xy, cell_side)[: CANDIDATES * wanted]]
+    spread = xy[
+        _evenly_ordered(xy, strength[rows, columns][usable], known_xy, cell_side)[: CANDIDATES_PER_CORNER * wanted]
+    ]
     chosen: FloatArray = spread[np.isfinite(_surface_at(view, spread).inverse_depth)][:wanted]
     return chosen
 
 
 def _evenly_ordered(xy: FloatArray, strength: Float32Array, known_xy: FloatArray, cell_side: float) -> IntArray:
-    """(K,) the order in which to take points: the strongest of each empty square cell, then all seconds, and so on.
+    """(K,) the order in which to take points: the strongest of each empty square cell, then all second ones, and so on.
 
-    That spreads them evenly, and yet none is saved for a cell of sky.
+    This spreads them evenly without reserving any for cells without corners.
 
     Args:
         xy: (K, 2). strength: (K,).
-        known_xy: (M, 2) points that are there already; their cells have had a turn for each.
+        known_xy: (M, 2) points that exist already; each counts as one taken from its cell.
         cell_side: in pixels.
     """
     both = np.concatenate([known_xy, xy])
@@ -355,8 +360,8 @@ def _corner_strength(grey: UInt8Array) -> Float32Array:
     Source: Shi and Tomasi 1994, "Good Features to Track".
     """
     # OpenCV sums, not averages, and scales Sobel's derivative (8 per grey level per pixel) by 1 / (4 * block * 255).
-    per_unit = (4 * CORNER_BLOCK * 255 / 8) ** 2 / CORNER_BLOCK**2
-    return np.asarray(cv2.cornerMinEigenVal(grey, CORNER_BLOCK, ksize=3) * per_unit, dtype=np.float32)
+    per_unit = (4 * CORNER_WINDOW_PX * 255 / 8) ** 2 / CORNER_WINDOW_PX**2
+    return np.asarray(cv2.cornerMinEigenVal(grey, CORNER_WINDOW_PX, ksize=3) * per_unit, dtype=np.float32)
 
 
 # ------------------------------------------------------------------------------ surfaces
@@ -375,10 +380,10 @@ class _Surface:
 def _surface_at(view: _View, xy: FloatArray) -> _Surface:
     """Planes fitted to the depth map under a patch, by least squares in inverse depth, which is linear on a plane.
 
-    Depth that jumps is another surface and left out; a pixel whose surroundings are mostly left out has none.
+    Pixels of another surface are left out. If they are too many, the result is NaN.
     """
     zoom = view.map_px_per_px
-    radius = max(2.0, PATCH_RADIUS * zoom.max())
+    radius = max(2.0, PATCH_RADIUS_PX * zoom.max())
     along = np.round(np.linspace(-radius, radius, SURFACE_SAMPLES)).astype(np.int64)
     window = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
     xy_map = np.where(np.isfinite(xy), xy, -1e6) * zoom
@@ -389,7 +394,7 @@ def _surface_at(view: _View, xy: FloatArray) -> _Surface:
     values = np.where(inside, view.inverse_depth[rows, columns], np.nan)
     middle = values[:, len(window) // 2, None]
     same = np.asarray(np.abs(values - middle) < WINDOW_PIXELS * middle)
-    enough = np.asarray(same.mean(axis=1) >= SURFACE_SHARE)
+    enough = np.asarray(same.mean(axis=1) >= MIN_SURFACE_FRACTION)
 
     terms = np.concatenate([np.ones((*same.shape, 1)), pixels + 0.5 - xy_map[:, None]], axis=-1)[enough]
     weighted = terms * same[enough, :, None]
@@ -408,8 +413,8 @@ class _Keypoints:
     Args:
         xy: (K, 2) in the grey image.
         points_world: (K, 3) by the image's own depth.
-        tangents_world: (K, 2, 3) how the point moves over the surface per pixel along x and y.
-        track: (K,) number of the track, before tracks were united.
+        tangents_world: (K, 2, 3) derivative of the point along the surface, per pixel in x and y.
+        track: (K,) number of the track, before unions.
     """
 
     xy: FloatArray
@@ -458,12 +463,16 @@ def _keypoints_at(view: _View, xy: FloatArray, track: IntArray) -> _Keypoints:
 
 
 class _Tracks:
-    """Keypoints of all images while they grow. Tracks that turn out to be one are united (a disjoint-set forest)."""
+    """Keypoints of all images while tracks grow.
+
+    Tracks of the same point are united in a disjoint-set forest, because ``roots`` is needed between two unions;
+    ``scipy.sparse.csgraph.connected_components`` takes the complete graph.
+    """
 
     def __init__(self, max_per_image: int) -> None:
         self._max_per_image = max_per_image
         self._keypoints: dict[int, _Keypoints] = {}
-        self._agreed: dict[Pair, _Camera] = {}
+        self._cameras: dict[Pair, _Camera] = {}
         self._parent = np.empty(0, np.int64)
 
     def of(self, image: int) -> _Keypoints:
@@ -493,7 +502,7 @@ class _Tracks:
         self._keypoints[view.index] = known.followed_by(keypoints.taken(on_surface[:room]))
 
     def unite(self, track_a: IntArray, track_b: IntArray) -> None:
-        """Make one track of every two of (K,) tracks, unless they are one already."""
+        """Unite the tracks (K,) with the tracks (K,), one by one."""
         for a, b in zip(track_a, track_b, strict=True):
             self._parent[self._root(a)] = self._root(b)
 
@@ -511,91 +520,95 @@ class _Tracks:
         _, rows_a, rows_b = np.intersect1d(self.roots(a), self.roots(b), return_indices=True)
         return np.stack([rows_a, rows_b], axis=1)
 
-    def agree(self, a: int, b: int, camera_b: _Camera) -> None:
-        """Note the camera of image b as image a sees it."""
-        self._agreed[a, b] = camera_b
+    def store_camera(self, a: int, b: int, camera_b: _Camera) -> None:
+        """Store the camera of image b that was estimated from points of image a."""
+        self._cameras[a, b] = camera_b
 
     def matched(self, i: int, j: int) -> IntArray:
-        """(M, 2) of the shared rows, those that lie where each image's depth puts them in the other."""
-        if (i, j) not in self._agreed or (j, i) not in self._agreed:
+        """(M, 2) of the shared rows, those at the position by each image's depth in the other."""
+        if (i, j) not in self._cameras or (j, i) not in self._cameras:
             return np.empty((0, 2), np.int64)
         rows = self.shared(i, j)
         in_i, in_j = self.of(i).taken(rows[:, 0]), self.of(j).taken(rows[:, 1])
-        near_j = self._agreed[i, j].sees(in_i.points_world, in_j.xy)
-        near_i = self._agreed[j, i].sees(in_j.points_world, in_i.xy)
+        near_j = self._cameras[i, j].sees(in_i.points_world, in_j.xy)
+        near_i = self._cameras[j, i].sees(in_j.points_world, in_i.xy)
         return rows[near_i & near_j]
 
 
-# ------------------------------------------------------------------------------ carrying
-def _carry_over(tracks: _Tracks, view_a: _View, view_b: _View) -> None:
-    """Find in image b what image a has and b has not yet, if the two agree on how they stand to each other."""
-    camera_b = _agreed_camera(tracks, view_a, view_b)
+# ------------------------------------------------------------------------------ transfer
+def _transfer_tracks(tracks: _Tracks, view_a: _View, view_b: _View) -> None:
+    """Find in image b the keypoints of image a that b does not have yet, if their relative pose can be estimated."""
+    camera_b = _estimated_camera(tracks, view_a, view_b)
     if camera_b is None:
         logger.debug("images %d and %d show no common motion", view_a.index, view_b.index)
         return
-    tracks.agree(view_a.index, view_b.index, camera_b)
+    tracks.store_camera(view_a.index, view_b.index, camera_b)
     in_a = tracks.missing(view_a.index, view_b.index)
-    carried = _carried(in_a, view_a, view_b, camera_b)
-    found = _found(in_a, carried.taken(carried.is_mutual), view_a, view_b, NEAR_REACH)
+    transferred = _transferred(in_a, view_a, view_b, camera_b)
+    found = _found(in_a, transferred.taken(transferred.is_mutual), view_a, view_b, NARROW_SEARCH_FRACTION)
     found = found.taken(camera_b.sees(in_a.points_world[found.rows], found.xy_b))
     _attach(tracks, view_a, view_b, in_a, found)
 
 
-def _agreed_camera(tracks: _Tracks, view_a: _View, view_b: _View) -> _Camera | None:
-    """The camera of b as the points of a see it, for stitched cameras are right to some pixels only.
+def _estimated_camera(tracks: _Tracks, view_a: _View, view_b: _View) -> _Camera | None:
+    """The camera of b by the points of a, because initial cameras are right to some pixels only.
 
-    Where the images share enough tracks, these tell. Elsewhere a sample of corners is looked for in a wide
-    reach. None where too few of them have a motion in common: either the stitched geometry is not to be
-    believed here, or the images show nothing of each other.
+    It is estimated from shared tracks. If there are too few, a sample of corners is searched in the wide radius. None
+    if too few of them agree: the initial geometry is wrong here, or the images do not overlap.
     """
-    if len(tracks.of(view_a.index)) < MIN_AGREEING:
+    if len(tracks.of(view_a.index)) < MIN_POSE_INLIERS:
         return None
     shared = tracks.shared(view_a.index, view_b.index)
     points_world = tracks.of(view_a.index).points_world[shared[:, 0]]
     xy_b = tracks.of(view_b.index).xy[shared[:, 1]]
-    if len(shared) < SAMPLE // 2:
+    if len(shared) < SAMPLE_CORNERS // 2:
         in_a = tracks.missing(view_a.index, view_b.index)
-        carried = _carried(in_a, view_a, view_b, view_b.camera)
-        carried = carried.taken(carried.is_near)
-        found = _found(in_a, carried.taken(_spread(len(carried.rows), SAMPLE)), view_a, view_b, WIDE_REACH)
+        transferred = _transferred(in_a, view_a, view_b, view_b.camera)
+        transferred = transferred.taken(transferred.is_near)
+        found = _found(
+            in_a,
+            transferred.taken(_spread(len(transferred.rows), SAMPLE_CORNERS)),
+            view_a,
+            view_b,
+            WIDE_SEARCH_FRACTION,
+        )
         points_world = np.concatenate([points_world, in_a.points_world[found.rows]])
         xy_b = np.concatenate([xy_b, found.xy_b])
-    few = _spread(len(xy_b), SAMPLE)
+    few = _spread(len(xy_b), SAMPLE_CORNERS)
     return _resected(view_b.camera, points_world[few], xy_b[few])
 
 
 def _spread(length: int, number: int) -> IntArray:
-    """At most so many of the positions below a length, evenly."""
+    """At most so many of the positions below a length, evenly spaced."""
     return np.linspace(0, length - 1, min(number, length)).astype(np.int64)
 
 
 def _resected(camera: _Camera, points_world: FloatArray, xy_img: FloatArray) -> _Camera | None:
-    """The camera turned and moved to see points (K, 3) at (K, 2); None where too few of them agree."""
-    if len(xy_img) < MIN_AGREEING:
+    """The camera at the pose that sees points (K, 3) at (K, 2); None if there are too few inliers."""
+    if len(xy_img) < MIN_POSE_INLIERS:
         return None
-    ransac = {"max_error": camera.reach_px(NEAR_REACH), "max_num_trials": 1000, "random_seed": 0}
+    ransac = {"max_error": camera.fraction_px(NARROW_SEARCH_FRACTION), "max_num_trials": 1000, "random_seed": 0}
     found = pycolmap.estimate_and_refine_absolute_pose(
         xy_img,
         points_world,
         camera.intrinsics.colmap_camera(),
         estimation_options=pycolmap.AbsolutePoseEstimationOptions(ransac=ransac),
     )
-    if found is None or found["num_inliers"] < max(MIN_AGREEING, MIN_AGREEING_SHARE * len(xy_img)):
+    if found is None or found["num_inliers"] < max(MIN_POSE_INLIERS, MIN_POSE_INLIER_FRACTION * len(xy_img)):
         return None
     return replace(camera, cam_from_world=found["cam_from_world"].matrix())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Carried:
-    """Keypoints of image a by geometry in image b, K of them; what b cannot show is left out.
+class _Transferred:
+    """K keypoints of image a at their positions by depth in image b.
 
     Args:
-        rows: (K,) of the keypoints of a that were given.
-        xy_b: (K, 2) where b should show them.
-        b_from_a: (K, 2, 2) how the patch lies there.
-        depth_difference: (K,) of what a and b say about the surface, relative.
-        missed_map_px: (K,) distance from the start after the way there and back by b's depth, in pixels of
-            a's depth map.
+        rows: (K,) of the keypoints of a.
+        xy_b: (K, 2) positions in b.
+        b_from_a: (K, 2, 2) warp of the patch.
+        depth_difference: (K,) between the depths of a and b, relative.
+        missed_map_px: (K,) distance after a transfer there and back by b's depth, in pixels of a's depth map.
     """
 
     rows: IntArray
@@ -604,9 +617,9 @@ class _Carried:
     depth_difference: FloatArray
     missed_map_px: FloatArray
 
-    def taken(self, chosen: IntArray | BoolArray) -> _Carried:
+    def taken(self, chosen: IntArray | BoolArray) -> _Transferred:
         """Some of them."""
-        return _Carried(
+        return _Transferred(
             rows=self.rows[chosen],
             xy_b=self.xy_b[chosen],
             b_from_a=self.b_from_a[chosen],
@@ -616,24 +629,26 @@ class _Carried:
 
     @property
     def is_near(self) -> BoolArray:
-        """(K,) whether the depths may be of one surface, the cameras being off."""
-        return self.depth_difference <= DEPTH_TOLERANCE[1]
+        """(K,) whether the depths can be of one surface, before the camera is estimated."""
+        return self.depth_difference <= DEPTH_TOLERANCE_RANGE[1]
 
     @property
     def is_mutual(self) -> BoolArray:
-        """(K,) whether the depths agree as well as depths do in this pair, and lead back."""
-        return _usual(self.depth_difference, *DEPTH_TOLERANCE) & (self.missed_map_px <= ROUND_TRIP_MAP_PX)
+        """(K,) whether the depths agree within their typical error in this pair, and lead back."""
+        return _within_typical_error(self.depth_difference, *DEPTH_TOLERANCE_RANGE) & (
+            self.missed_map_px <= MAX_ROUND_TRIP_MAP_PX
+        )
 
 
-def _carried(in_a: _Keypoints, view_a: _View, view_b: _View, camera_b: _Camera) -> _Carried:
-    """Through space to image b, whose camera is ``camera_b``, and back by what depth b has there."""
+def _transferred(in_a: _Keypoints, view_a: _View, view_b: _View, camera_b: _Camera) -> _Transferred:
+    """To image b with the camera ``camera_b``, and back by the depth of b; positions outside of b are left out."""
     xy_b = camera_b.xy_img(in_a.points_world)
     beside = camera_b.xy_img((in_a.points_world[:, None] + in_a.tangents_world).reshape(-1, 3)).reshape(-1, 2, 2)
     b_from_a = np.swapaxes(beside - xy_b[:, None], 1, 2)
     inverse_depth = _surface_at(view_b, xy_b).inverse_depth
     back = view_a.camera.xy_img(camera_b.points_world(xy_b, inverse_depth))
     rows = np.flatnonzero(camera_b.holds(xy_b) & np.isfinite(inverse_depth) & _comparable(b_from_a))
-    everything = _Carried(
+    everything = _Transferred(
         rows=np.arange(len(in_a)),
         xy_b=xy_b,
         b_from_a=b_from_a,
@@ -644,7 +659,7 @@ def _carried(in_a: _Keypoints, view_a: _View, view_b: _View, camera_b: _Camera) 
 
 
 def _comparable(b_from_a: FloatArray) -> BoolArray:
-    """(K,) whether a patch is neither mirrored nor stretched beyond ``MAX_STRETCH``; false for NaN."""
+    """(K,) whether a warp neither mirrors nor stretches beyond ``MAX_STRETCH``; false for NaN."""
     finite = np.asarray(np.isfinite(b_from_a).all(axis=(1, 2)))
     safe = np.where(finite[:, None, None], b_from_a, 0)
     stretch = np.linalg.svd(safe, compute_uv=False)
@@ -655,7 +670,7 @@ def _comparable(b_from_a: FloatArray) -> BoolArray:
 # ------------------------------------------------------------------------------- finding
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Found:
-    """Keypoints of image a that image b shows, best first: (K,) rows and (K, 2) places in b."""
+    """Keypoints of image a found in image b, best first: (K,) rows and (K, 2) positions in b."""
 
     rows: IntArray
     xy_b: FloatArray
@@ -665,20 +680,20 @@ class _Found:
         return _Found(rows=self.rows[chosen], xy_b=self.xy_b[chosen])
 
 
-def _found(in_a: _Keypoints, carried: _Carried, view_a: _View, view_b: _View, reach: float) -> _Found:
-    """Of the keypoints carried over, those whose patch image b shows within reach; no place is taken twice."""
+def _found(in_a: _Keypoints, transferred: _Transferred, view_a: _View, view_b: _View, fraction: float) -> _Found:
+    """The transferred keypoints whose patch is found in image b within a fraction of its side; each position once."""
     aligned = align_patches(
         view_a.pyramid,
-        in_a.xy[carried.rows],
+        in_a.xy[transferred.rows],
         view_b.pyramid,
-        carried.xy_b,
-        carried.b_from_a,
-        reach_px=view_b.camera.reach_px(reach),
+        transferred.xy_b,
+        transferred.b_from_a,
+        reach_px=view_b.camera.fraction_px(fraction),
     )
     order = np.argsort(-aligned.correlation, kind="stable")
     order = order[(aligned.correlation[order] >= MIN_CORRELATION) & view_b.camera.holds(aligned.xy_b[order])]
     order = order[_first_in_place(aligned.xy_b[order])]
-    return _Found(rows=carried.rows[order], xy_b=aligned.xy_b[order])
+    return _Found(rows=transferred.rows[order], xy_b=aligned.xy_b[order])
 
 
 def _first_in_place(xy: FloatArray) -> BoolArray:
@@ -691,7 +706,7 @@ def _first_in_place(xy: FloatArray) -> BoolArray:
 
 
 def _attach(tracks: _Tracks, view_a: _View, view_b: _View, in_a: _Keypoints, found: _Found) -> None:
-    """What lies on a keypoint of image b becomes it, the others are new keypoints of b."""
+    """Unite what lies on a keypoint of image b with its track; the others are new keypoints of b."""
     new = _keypoints_at(view_b, found.xy_b, in_a.track[found.rows])
     known = tracks.of(view_b.index)
     if len(known) and len(new):
@@ -704,6 +719,3 @@ def _attach(tracks: _Tracks, view_a: _View, view_b: _View, in_a: _Keypoints, fou
         tracks.unite(track_a[free], track_b[free])
         new = new.taken(~on_known)
     tracks.add(view_b, new)
-
-
-# ---------------------------------------------------------------------------- photometry

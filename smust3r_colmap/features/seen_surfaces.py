@@ -1,4 +1,7 @@
-"""Which surface each image sees: from depth maps, or from a cloud without tracks. Pairs for tracks are chosen by it."""
+"""The surface that each image sees, from depth maps or from a cloud without tracks.
+
+The next module to read is ``covisibility``.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +16,13 @@ from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import DepthMaps, Scene
 
 CLOUD_POINTS_PER_IMAGE = 500
-"""Of a cloud without tracks, how many points say what an image sees."""
+"""Of a cloud without tracks, that represent what an image sees."""
 MAX_CLOUD_POINTS = 50_000
-"""Of a whole cloud: every image looks at all of them, 17 s for 1000 images."""
-GRID = 12
-"""Cells along the longer side of an image in which its surface is sampled."""
+"""Of a whole cloud, because all are projected into every image: 17 s for 1000 images."""
+GRID_CELLS = 12
+"""Along the longer side of an image, in which its surface is sampled."""
 MIN_CONFIDENCE = 1.5
-"""Of depth that is sampled; 1 is none at all."""
+"""Of depth that is sampled; 1 is no confidence."""
 
 
 def surfaces_of_maps(scenes: Sequence[Scene], maps: DepthMaps) -> dict[int, FloatArray]:
@@ -32,7 +35,7 @@ def surfaces_of_maps(scenes: Sequence[Scene], maps: DepthMaps) -> dict[int, Floa
             if name not in maps:
                 continue
             depth = np.where(maps.confidence(name) > MIN_CONFIDENCE, maps.depth(name), 0)
-            step = max(1, max(depth.shape) // GRID)
+            step = max(1, max(depth.shape) // GRID_CELLS)
             coarse = depth[step // 2 :: step, step // 2 :: step]
             intrinsics = scene.cameras[camera].resized(coarse.shape[1], coarse.shape[0])
             points = pointmap_from_depth(coarse, intrinsics, invert_rigid(pose)).reshape(-1, 3)
@@ -41,7 +44,7 @@ def surfaces_of_maps(scenes: Sequence[Scene], maps: DepthMaps) -> dict[int, Floa
 
 
 def surfaces_of_clouds(scenes: Sequence[Scene]) -> dict[int, FloatArray]:
-    """The same from the points of the scenes: of those that fall into an image the nearest in every cell of a grid."""
+    """The same from the points of the scenes: the nearest one in every cell of a grid over the image."""
     surfaces: dict[int, FloatArray] = {}
     for scene in reversed(scenes):
         wanted = min(CLOUD_POINTS_PER_IMAGE * len(scene), MAX_CLOUD_POINTS)
@@ -58,15 +61,15 @@ def _nearest_in_cells(xyz: FloatArray, cam_from_world: FloatArray, intrinsics: I
         return np.empty((0, 3))
     xy = np.nan_to_num(intrinsics.xy_img(points_cam[front]), nan=-1.0)
     inside = (xy >= 0).all(axis=1) & (xy[:, 0] < intrinsics.width) & (xy[:, 1] < intrinsics.height)
-    front, cell = front[inside], (xy[inside] / (intrinsics.width, intrinsics.height) * GRID).astype(np.int64)
+    front, cell = front[inside], (xy[inside] / (intrinsics.width, intrinsics.height) * GRID_CELLS).astype(np.int64)
     order = np.argsort(points_cam[front, 2], kind="stable")
-    _, first = np.unique((cell[:, 1] * GRID + cell[:, 0])[order], return_index=True)
+    _, first = np.unique((cell[:, 1] * GRID_CELLS + cell[:, 0])[order], return_index=True)
     nearest: FloatArray = xyz[front[order[first]]]
     return nearest
 
 
 def seen_surfaces(scene: Scene, surfaces: Mapping[int, FloatArray]) -> list[SeenSurface]:
-    """One per image of the scene; of an image without surface no point."""
+    """One per image of the scene; without points if ``surfaces`` has none."""
     return [
         SeenSurface(
             image=index,

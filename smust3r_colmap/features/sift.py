@@ -3,7 +3,7 @@
 Everything lies in one COLMAP database whose ids we assign before anything is extracted
 (image id = index + 1), because COLMAP itself numbers images in the order in which its threads
 finish. What is in the database is done: a second start extracts and matches only what is missing.
-The next module to read is ``mapping``.
+The next module to read is ``matching``.
 """
 
 from __future__ import annotations

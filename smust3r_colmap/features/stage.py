@@ -1,5 +1,7 @@
-"""SIFT of all images of a run, once, in a database of ours: what the classical backbone maps, and what the tracks of
-any backbone are made of. The next module to read is ``mapping``."""
+"""SIFT of all images of a run, extracted once, for the classical backbone and for the tracks of every backbone.
+
+The next module to read is ``correspondences``.
+"""
 
 from __future__ import annotations
 

@@ -1,9 +1,10 @@
-"""Which images the model holds in a wrong place: what verified matches say of its pairs, and who is tied to whom.
+"""Images that the model holds at a wrong pose, found by the verified matches of image pairs.
 
-In a sound model nearly all verified matches of near images lie on their epipolar lines; over a bend a good part
-does not. But one pair proves little: look-alike places match where nothing is wrong, and an epipolar line or two runs
-right over any bend. So pairs vote, groups of images grow together where more votes are for it than against, and
-a group that the largest one contradicts is bent. The next module to read is ``replacement``.
+In a sound model nearly all verified matches of nearby images satisfy the epipolar constraint. A single pair proves
+little: look-alike places match where nothing is wrong, and a few epipolar lines fit by chance. So images are grouped
+by weighted agglomerative clustering. The weight of a pair is positive where its matches support the model and
+negative where they contradict it. A cluster that the largest cluster contradicts is misregistered.
+The next module to read is ``reregistration``.
 """
 
 from __future__ import annotations
@@ -15,102 +16,104 @@ from dataclasses import dataclass
 
 from smust3r_colmap.geometry.arrays import Pair
 
-STRONG_MATCHES = 30
-"""Verified matches of a pair that may speak against the model; COLMAP's own bar for registration."""
-SOUND_SHARE, DENYING_SHARE = 0.85, 0.7
-"""Of a pair's verified matches, on their epipolar lines. Sound models of nine collections are tied together by pairs
-above 0.85; verification errs on repeating facades, whose pairs come down to 0.75 where nothing is wrong."""
+MIN_CONTRADICTING_MATCHES = 30
+"""Verified matches of a pair that may contradict the model; COLMAP's minimum for registration."""
+MIN_SUPPORTING_FRACTION, MAX_CONTRADICTING_FRACTION = 0.85, 0.7
+"""Of a pair's verified matches that satisfy the epipolar constraint. Sound models of nine collections are connected by
+pairs above 0.85. Two-view verification errs on repetitive facades, whose pairs fall to 0.75 in sound models."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Agreement:
-    """What the verified matches of one pair say of the model.
+class EpipolarSupport:
+    """How the verified matches of one pair fit the model.
 
     Args:
-        num_matches: how many there are.
-        share: the part that lies on its epipolar lines.
+        num_matches: of the pair.
+        inlier_fraction: of them that satisfy the epipolar constraint.
     """
 
     num_matches: int
-    share: float
+    inlier_fraction: float
 
     @property
-    def vote(self) -> int:
-        """Above 0 for the model, below against it; 0 from a pair that is undecided, or has too few matches to deny it.
+    def weight(self) -> int:
+        """Positive: the pair supports the model. Negative: it contradicts it. 0: undecided, or too few matches.
 
-        A pair's word counts as the root of its matches: those of a repeating facade, seen from far apart, are few.
+        Its size is the square root of the number of matches, because pairs from across a repetitive facade are many,
+        and each has few matches.
         """
-        word = math.isqrt(self.num_matches)
-        if self.share >= SOUND_SHARE:
-            return word
-        return -word if self.share < DENYING_SHARE and self.num_matches >= STRONG_MATCHES else 0
+        size = math.isqrt(self.num_matches)
+        if self.inlier_fraction >= MIN_SUPPORTING_FRACTION:
+            return size
+        contradicts = self.inlier_fraction < MAX_CONTRADICTING_FRACTION
+        return -size if contradicts and self.num_matches >= MIN_CONTRADICTING_MATCHES else 0
 
 
-def bent_images(agreements: Mapping[Pair, Agreement], images: Collection[int]) -> tuple[int, ...]:
-    """Images of the groups that the bulk contradicts, and of those that hang on such a group; ascending.
+def find_misregistered(support: Mapping[Pair, EpipolarSupport], images: Collection[int]) -> tuple[int, ...]:
+    """Images of clusters that contradict the largest cluster, directly or through another such cluster; ascending.
 
     Args:
-        agreements: by pair (i < j) of image indices.
+        support: by pair (i < j) of image indices.
         images: indices of all images of the model.
 
     Returns:
-        Empty, too, where no bulk of more than half of the images is tied together: then nothing can be told.
+        Empty, too, if the largest cluster has at most half of the images: then it is not known which part is wrong.
     """
-    groups = _groups({pair: found.vote for pair, found in agreements.items() if found.vote}, images)
-    bulk = max(groups.members, key=lambda group: (len(groups.members[group]), -group))
-    if 2 * len(groups.members[bulk]) <= len(images):
+    clusters = _cluster({pair: found.weight for pair, found in support.items() if found.weight}, images)
+    largest = max(clusters.members, key=lambda cluster: (len(clusters.members[cluster]), -cluster))
+    if 2 * len(clusters.members[largest]) <= len(images):
         return ()
-    contradicted, waiting = {bulk}, [bulk]
+    contradicted, waiting = {largest}, [largest]
     while waiting:
-        for other, link in groups.links[waiting.pop()].items():
-            if link.net < 0 and other not in contradicted:
+        for other, connection in clusters.connections[waiting.pop()].items():
+            if connection.weight < 0 and other not in contradicted:
                 contradicted.add(other)
                 waiting.append(other)
-    return tuple(sorted(i for group in contradicted - {bulk} for i in groups.members[group]))
+    return tuple(sorted(i for cluster in contradicted - {largest} for i in clusters.members[cluster]))
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Link:
-    """Between two groups: votes for less votes against, and how many there are for."""
+class _Connection:
+    """Between two clusters: the sum of the weights, and how many pairs support it."""
 
-    net: int
-    ties: int
+    weight: int
+    num_supporting: int
 
-    def __add__(self, other: _Link) -> _Link:
-        return _Link(net=self.net + other.net, ties=self.ties + other.ties)
+    def __add__(self, other: _Connection) -> _Connection:
+        return _Connection(weight=self.weight + other.weight, num_supporting=self.num_supporting + other.num_supporting)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Groups:
+class _Clusters:
     members: dict[int, list[int]]
-    links: dict[int, dict[int, _Link]]
+    connections: dict[int, dict[int, _Connection]]
 
 
-def _groups(votes: Mapping[Pair, int], images: Collection[int]) -> _Groups:
-    """Images that grow together, the best tied first, as long as some pair ties them and not more pairs deny it."""
+def _cluster(weights: Mapping[Pair, int], images: Collection[int]) -> _Clusters:
+    """Merge clusters, the heaviest connection first, while one has a supporting pair and no negative weight."""
     members = {i: [i] for i in sorted(images)}
-    links: dict[int, dict[int, _Link]] = {i: {} for i in members}
-    for (i, j), vote in votes.items():
-        links[i][j] = links[j][i] = _Link(net=vote, ties=int(vote > 0))
-    queue = [entry for a in links for entry in _candidates(links, a) if entry[1] < entry[2]]
+    connections: dict[int, dict[int, _Connection]] = {i: {} for i in members}
+    for (i, j), weight in weights.items():
+        connections[i][j] = connections[j][i] = _Connection(weight=weight, num_supporting=int(weight > 0))
+    queue = [entry for a in connections for entry in _candidates(connections, a) if entry[1] < entry[2]]
     heapq.heapify(queue)
     while queue:
-        against, a, b = heapq.heappop(queue)
-        if a not in links or b not in links[a] or links[a][b].net != -against:
-            continue  # of groups that have grown since
+        negative_weight, a, b = heapq.heappop(queue)
+        if a not in connections or b not in connections[a] or connections[a][b].weight != -negative_weight:
+            continue  # the cluster has grown since
         members[a] += members.pop(b)
-        for other, link in links.pop(b).items():
-            del links[other][b]
+        for other, connection in connections.pop(b).items():
+            del connections[other][b]
             if other != a:
-                grown = links[a].get(other, _Link(net=0, ties=0)) + link
-                links[a][other] = links[other][a] = grown
-        for entry in _candidates(links, a):
+                grown = connections[a].get(other, _Connection(weight=0, num_supporting=0)) + connection
+                connections[a][other] = connections[other][a] = grown
+        for entry in _candidates(connections, a):
             heapq.heappush(queue, entry)
-    return _Groups(members=members, links=links)
+    return _Clusters(members=members, connections=connections)
 
 
-def _candidates(links: Mapping[int, Mapping[int, _Link]], a: int) -> Iterator[tuple[int, int, int]]:
-    """What may grow together with group ``a``, as the queue holds it."""
-    for b, link in links[a].items():
-        if link.ties and link.net >= 0:
-            yield -link.net, min(a, b), max(a, b)
+def _candidates(connections: Mapping[int, Mapping[int, _Connection]], a: int) -> Iterator[tuple[int, int, int]]:
+    """Clusters that may be merged with ``a``, as entries of the queue."""
+    for b, connection in connections[a].items():
+        if connection.num_supporting and connection.weight >= 0:
+            yield -connection.weight, min(a, b), max(a, b)

@@ -1,14 +1,13 @@
-"""Where the optical axis meets the image: asked only where the model can answer.
+"""Estimating the principal points where the model determines them.
 
-COLMAP keeps the principal point in the middle of the image, because a few images do not determine it. Many
-images from many sides do, and then a wrong one bends the whole model: freeing it took the cameras of a
-courtyard from 0.19 m to 0.03 m. So two halves of the points are asked separately, each with cameras of its
-own, and the answer counts where they agree and the pixels are clearly better off. Without that second
-condition both halves fall for what the camera model leaves out: a straight street traded it for a shift of
-18 pixels and turned every camera by a degree, to lower the cost by 0.4 %. The priors of the centres, which both
-share, are loosened before: cameras that never turn, such as of a drone that flies sideways, leave a shear of the
-whole world open, priors would close it by their own errors, and both halves would agree on them.
-The next module to read is ``task``.
+COLMAP keeps the principal point at the image centre, because a few images do not determine it. Many images from many
+sides do, and then a wrong one bends the whole model: refining it took the cameras of a courtyard from 0.19 m to 0.03 m.
+So two halves of the points estimate it separately, each with its own copy of the cameras. The estimate is used if the
+halves agree and the cost is clearly lower. Without the second condition both halves fit what the camera model lacks: on
+a straight street a shift of 18 px lowered the cost by 0.4 % and turned every camera by a degree. The position priors,
+which the halves share, are loosened before: cameras that never turn, such as of a drone that flies sideways, leave a
+shear of the whole world free, tight priors would fix it by their own errors, and both halves would agree on these.
+The next module to read is ``registration``.
 """
 
 from __future__ import annotations
@@ -22,45 +21,47 @@ import pycolmap
 
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.refinement.bundle_adjustment import Priors, adjust, robust_cost
-from smust3r_colmap.refinement.subset_adjustment import part_of
+from smust3r_colmap.refinement.subset_adjustment import subset_of_points
 
 logger = logging.getLogger(__name__)
 
 MIN_IMAGES = 8
 """Of each camera; fewer do not determine a principal point."""
-OBSERVATIONS, MIN_OBSERVATIONS_PER_IMAGE = 20_000, 100
-"""Of each half: as many as are quick to adjust, spread over the images, but of each image some."""
-MAX_SHIFT = 0.025
-"""As a part of the longer image side; real cameras stay within a percent or two."""
-AGREEMENT = 0.5
-"""Part of the shift by which the two halves may differ: four standard deviations of their mean."""
-MIN_GAIN = 0.006
-"""Part of the cost that the shift must save in each half: less may make up for what the camera model lacks."""
-LOOSE = 100.0
-"""Times the standard deviation of the priors: they hold frame and scale, and say nothing of a principal point."""
+TARGET_OBSERVATIONS, MIN_OBSERVATIONS_PER_IMAGE = 20_000, 100
+"""Of each half: a number that is quick to adjust, spread over the images, and a minimum for each image."""
+MAX_SHIFT_FRACTION = 0.025
+"""Of the longer image side; real cameras stay within a percent or two."""
+MAX_DIFFERENCE_FRACTION = 0.5
+"""Of the shift, by which the two halves may differ: four standard deviations of their mean."""
+MIN_COST_REDUCTION = 0.006
+"""Fraction of the cost that the shift must save in each half; less can come from what the camera model lacks."""
+PRIOR_SIGMA_FACTOR = 100.0
+"""On the standard deviation of the priors: they hold frame and scale, and do not constrain the principal point."""
 MAX_ITERATIONS = 30
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PrincipalPointAnswer:
-    """What the two halves said.
+class PrincipalPointEstimate:
+    """The estimate of the two halves.
 
     Args:
-        xy_img: by camera id, the mean of those that were asked: the second is not where the first saves too little.
-        reason: why the answer does not count, or empty.
+        xy_img: by camera id, the mean of the halves; of the first only, if it saves too little.
+        reason: why the estimate is not used, or empty.
     """
 
     xy_img: dict[int, FloatArray]
     reason: str = ""
 
 
-def ask_for_principal_points(model: pycolmap.Reconstruction, priors: Priors, *, threads: int) -> PrincipalPointAnswer:
-    """Let two halves of the points of ``model``, which stays as it is, say where the principal points are.
+def estimate_principal_points(
+    model: pycolmap.Reconstruction, priors: Priors, *, threads: int
+) -> PrincipalPointEstimate:
+    """Estimate the principal points from two halves of the points.
 
     Args:
-        model: adjusted, with tracks.
-        priors: where the cameras were; only frame and scale are taken from them.
-        threads: of Ceres; with one the answer is the same in every run.
+        model: adjusted, with tracks; it is not changed.
+        priors: of the camera centres; only frame and scale are taken from them.
+        threads: of Ceres; with one the estimate is the same in every run.
     """
     counts = dict.fromkeys(sorted(model.cameras), 0)
     for image_id in model.reg_image_ids():
@@ -68,46 +69,42 @@ def ask_for_principal_points(model: pycolmap.Reconstruction, priors: Priors, *, 
     used = [camera_id for camera_id, count in counts.items() if count]
     poor = [camera_id for camera_id in used if counts[camera_id] < MIN_IMAGES]
     if poor:
-        return PrincipalPointAnswer(xy_img={}, reason=f"camera {poor[0]} has {counts[poor[0]]} of {MIN_IMAGES} images")
-    loose = replace(priors, sigma=LOOSE * priors.sigma)
-    enough = max(OBSERVATIONS // model.num_reg_images(), MIN_OBSERVATIONS_PER_IMAGE)
+        reason = f"camera {poor[0]} has {counts[poor[0]]} of {MIN_IMAGES} images"
+        return PrincipalPointEstimate(xy_img={}, reason=reason)
+    loose = replace(priors, sigma=PRIOR_SIGMA_FACTOR * priors.sigma)
+    per_image = max(TARGET_OBSERVATIONS // model.num_reg_images(), MIN_OBSERVATIONS_PER_IMAGE)
     halves = []
     for half in (0, 1):
-        part = part_of(model, observations_per_image=enough, first=half, step=2)
+        subset = subset_of_points(model, observations_per_image=per_image, first=half, step=2)
         costs = []
         for free in (False, True):
             if not adjust(
-                part, loose, calibrated=False, principal_point=free, max_iterations=MAX_ITERATIONS, threads=threads
+                subset, loose, calibrated=False, principal_point=free, max_iterations=MAX_ITERATIONS, threads=threads
             ):
-                return PrincipalPointAnswer(xy_img={}, reason="half of the points gave no solution")
-            costs.append(robust_cost(part))
-        halves.append({camera_id: _principal_point(part.camera(camera_id)) for camera_id in used})
-        gain = 1 - costs[1] / costs[0] if costs[0] > 0 else 0.0
-        logger.info("half %d: another principal point saves %.2f %% of the cost", half, 100 * gain)
-        if not gain >= MIN_GAIN:  # or no number
-            reason = f"another place would save only {max(100 * gain, 0):.2f} % of the cost"
-            return PrincipalPointAnswer(xy_img=_mean(halves), reason=reason)
-    answer = _mean(halves)
-    for camera_id in used:
-        reason = _why_not(model.camera(camera_id), halves[0][camera_id], halves[1][camera_id])
-        if reason:
-            return PrincipalPointAnswer(xy_img=answer, reason=reason)
-    return PrincipalPointAnswer(xy_img=answer)
+                return PrincipalPointEstimate(xy_img={}, reason="no usable solution for half of the points")
+            costs.append(robust_cost(subset))
+        halves.append({camera_id: _principal_point(subset.camera(camera_id)) for camera_id in used})
+        saved = 1 - costs[1] / costs[0] if costs[0] > 0 else 0.0
+        logger.info("half %d: another principal point saves %.2f %% of the cost", half, 100 * saved)
+        if not saved >= MIN_COST_REDUCTION:  # also if it is NaN
+            reason = f"another principal point saves only {max(100 * saved, 0):.2f} % of the cost"
+            return PrincipalPointEstimate(xy_img=_mean(halves), reason=reason)
+    reasons = (_rejection_reason(model.camera(i), halves[0][i], halves[1][i]) for i in used)
+    return PrincipalPointEstimate(xy_img=_mean(halves), reason=next(filter(None, reasons), ""))
 
 
 def _mean(halves: Sequence[Mapping[int, FloatArray]]) -> dict[int, FloatArray]:
     return {camera_id: np.mean([half[camera_id] for half in halves], axis=0) for camera_id in halves[0]}
 
 
-def _why_not(camera: pycolmap.Camera, first: FloatArray, second: FloatArray) -> str:
-    longer = max(camera.width, camera.height)
+def _rejection_reason(camera: pycolmap.Camera, first: FloatArray, second: FloatArray) -> str:
     shift = float(np.linalg.norm((first + second) / 2 - _principal_point(camera)))
-    apart = float(np.linalg.norm(first - second))
+    difference = float(np.linalg.norm(first - second))
     logger.info("camera %d: principal point %s and %s", camera.camera_id, first.round(2), second.round(2))
-    if not np.isfinite(shift + apart) or shift > MAX_SHIFT * longer:
+    if not np.isfinite(shift + difference) or shift > MAX_SHIFT_FRACTION * max(camera.width, camera.height):
         return f"the principal point of camera {camera.camera_id} would move by {shift:.1f} px"
-    if apart > AGREEMENT * shift:
-        return f"two halves of the points put it {apart:.1f} px apart, for a shift of {shift:.1f} px"
+    if difference > MAX_DIFFERENCE_FRACTION * shift:
+        return f"two halves of the points differ by {difference:.1f} px, for a shift of {shift:.1f} px"
     return ""
 
 

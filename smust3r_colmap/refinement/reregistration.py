@@ -1,17 +1,17 @@
-"""Images that the model holds in a wrong place, taken out and placed again.
+"""Re-registration of misregistered images.
 
-A segment can be bent where few points hold it together: a step straight ahead into the distance, the end of a
-walk. Adjustment does not get out of it, since every bent image sees its own points without error, nor does
-resection, for the points of the bend are few and far. So bent images, see ``bends``, are mapped anew together with
-those they match in the bulk of the model, by COLMAP's global mapper, which takes the turns from pairs alone.
-The next module to read is ``principal_point``.
+Stitching bends a segment where few points connect its images: a step straight ahead into the distance, the end of a
+walk. Bundle adjustment does not correct this, because the images beyond the bend see their own points without error.
+Resection does not correct it either, because points across the bend are few and far. So misregistered images are
+mapped again, together with the images they match in the rest of the model, by COLMAP's global mapper, which estimates
+rotations from pairs alone. The next module to read is ``principal_point``.
 """
 
 from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,108 +24,114 @@ from smust3r_colmap.evaluation.readers import read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.execution.task_pool import TaskFailure, in_child
 from smust3r_colmap.features.guided_verification import (
-    MIN_CONSENT,
+    MIN_INLIER_FRACTION,
     MIN_MATCHES,
     MIN_VERIFIED,
     MatchedFeatures,
-    ask_consent,
-    consent_shares,
+    inlier_fractions,
 )
 from smust3r_colmap.geometry.arrays import FloatArray, Pair
 from smust3r_colmap.geometry.sim3 import invert_rigid
-from smust3r_colmap.refinement.acceptance import StepReport, movement, report_of
-from smust3r_colmap.refinement.bundle_adjustment import ModelFigures, Tolerance, figures_of, triangulate
-from smust3r_colmap.refinement.mapper import TIGHT_PART, Bench
-from smust3r_colmap.refinement.misregistration import SOUND_SHARE, Agreement, bent_images
+from smust3r_colmap.refinement.acceptance import movement, report_of
+from smust3r_colmap.refinement.bundle_adjustment import Tolerance, triangulate
+from smust3r_colmap.refinement.mapper import FINE_TOLERANCE_FRACTION, MapperSession
+from smust3r_colmap.refinement.misregistration import MIN_SUPPORTING_FRACTION, EpipolarSupport, find_misregistered
+from smust3r_colmap.refinement.statistics import Statistics, StepReport
 
 logger = logging.getLogger(__name__)
 
-NAME = "images placed again"
+NAME = "re-registration"
 MAX_NEIGHBOURS = 24
-"""Images of the bulk that are mapped along, those with most matches first: they say where the others belong."""
-MAX_BENT = 60
-"""More is no bend but a model in parts, and more than the global mapper does in passing."""
-_NOT_MAPPED = "{} images are bent, and the global mapper does not tie them to their neighbours"
+"""Images of the rest of the model that are mapped along, those with most matches first; they define the frame."""
+MAX_MISREGISTERED = 60
+"""With more, the model itself is in doubt, and mapping them takes the global mapper too long."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Replacement:
-    """What came of it.
+def reregister_images(
+    session: MapperSession,
+    tolerance: Tolerance,
+    *,
+    map_images: Callable[[MapperSession, Collection[int]], dict[int, FloatArray]] | None = None,
+) -> StepReport | None:
+    """Find misregistered images, map them again, and accept the new poses if the matches fit them better.
 
-    Args:
-        bench: to go on with; the given one, or one with other places, matches and tracks.
-        cam_from_world: (3, 4) of the images that stand elsewhere now, by image index.
-        report: of the step; None where no image is bent.
-    """
-
-    bench: Bench
-    cam_from_world: Mapping[int, FloatArray]
-    report: StepReport | None
-
-
-def place_bent_images_again(bench: Bench, features: MatchedFeatures, tolerance: Tolerance) -> Replacement:
-    """Map bent images anew beside the bulk, and keep that if more of their matches agree and none are bent any more.
+    After an accepted step the session is verified and triangulated at the new poses.
 
     Args:
-        bench: adjusted once, with tracks; used up where images were placed.
-        features: of the run, with all verified matches.
+        session: with tracks, adjusted once; gets the report of the step.
         tolerance: of the tracks that the images get.
+        map_images: gives new (3, 4) ``cam_from_world`` of the images; ``map_with_neighbours`` by default.
+
+    Returns:
+        The report; None if no image is misregistered.
     """
-    poses, figures = poses_of(bench.model), figures_of(bench.model)
-    before = _agreements(bench, poses, features)
-    bent = bent_images(before, poses.keys())
-    if not bent:
-        return Replacement(bench=bench, cam_from_world={}, report=None)
+    poses, statistics = poses_of(session.model), Statistics.of(session.model)
+    before = _support(session, poses)
+    wrong = find_misregistered(before, poses.keys())
+    if not wrong:
+        return None
     found: dict[int, FloatArray] = {}
-    if len(bent) > MAX_BENT:
-        reason = f"{len(bent)} images are bent, and more than {MAX_BENT} are not placed again"
+    if len(wrong) > MAX_MISREGISTERED:
+        reason = f"more than {MAX_MISREGISTERED}, the limit of re-registration"
     else:
-        found = _mapped_anew(bench, poses, bent, features)
-        after = _agreements(bench, {**poses, **found}, features)
-        reason = _why_no_better(before, after, bent, poses.keys()) if found else _NOT_MAPPED.format(len(bent))
-    if reason:
-        return Replacement(bench=bench, cam_from_world={}, report=_report(bench, figures, poses, reason))
-    for index, pose in found.items():
-        # Points of the old place go with it.
-        frame_id = bench.model.image(index + 1).frame_id
-        bench.mapper.observation_manager.deregister_frame(frame_id)
-        bench.model.frame(frame_id).rig_from_world = pycolmap.Rigid3d(pose)
-        bench.model.register_frame(frame_id)
-    bench = bench.with_matches(ask_consent(features, bench.views(), tolerance=TIGHT_PART))
-    triangulate(bench.mapper, tolerance)
-    return Replacement(bench=bench, cam_from_world=found, report=_report(bench, figures, poses, ""))
+        found = (map_images or map_with_neighbours)(session, wrong)
+        reason = "the global mapper does not connect them with their neighbours"
+    if found:
+        reason = _rejection_reason(before, _support(session, {**poses, **found}), wrong, poses.keys())
+    if not reason:
+        session.move_images(found)
+        session.verify(FINE_TOLERANCE_FRACTION)
+        triangulate(session.mapper, tolerance)
+    reason = reason and f"{len(wrong)} misregistered images: {reason}; kept the old poses"
+    moved, turned = movement(poses, poses_of(session.model))
+    report = report_of(NAME, statistics, Statistics.of(session.model), moved, turned, reason)
+    session.steps.append(report)
+    return report
 
 
-def are_any_bent(bench: Bench, features: MatchedFeatures) -> bool:
-    """Some images of the model are bent as it stands now: what later steps adjust may straighten them."""
-    poses = poses_of(bench.model)
-    return bool(bent_images(_agreements(bench, poses, features), poses.keys()))
+def any_misregistered(session: MapperSession) -> bool:
+    """Whether the model has misregistered images now; later adjustments may have corrected them."""
+    poses = poses_of(session.model)
+    return bool(find_misregistered(_support(session, poses), poses.keys()))
 
 
-def _why_no_better(
-    before: Mapping[Pair, Agreement], after: Mapping[Pair, Agreement], bent: Collection[int], images: Collection[int]
+def _support(session: MapperSession, poses: Mapping[int, FloatArray]) -> dict[Pair, EpipolarSupport]:
+    fractions = inlier_fractions(
+        session.features, session.views(poses), tolerance=FINE_TOLERANCE_FRACTION, min_matches=MIN_MATCHES
+    )
+    return {
+        pair: EpipolarSupport(num_matches=len(session.features.verified[pair]), inlier_fraction=fraction)
+        for pair, fraction in fractions.items()
+    }
+
+
+def _rejection_reason(
+    before: Mapping[Pair, EpipolarSupport],
+    after: Mapping[Pair, EpipolarSupport],
+    wrong: Collection[int],
+    images: Collection[int],
 ) -> str:
-    """In words, or empty where the new places are better.
+    """Why the new poses are rejected; empty if they are accepted.
 
-    More matches must agree than before, and no pair may lose the consent that it had: look-alikes of another
-    place would gain many matches and lose the few true ones.
+    More matches must fit than before, and no pair that fitted may be contradicted: look-alike places would gain many
+    matches and lose the few true ones.
     """
-    around = [pair for pair in before if not set(pair).isdisjoint(bent)]
-    agreed, agree = (round(sum(one[p].share * one[p].num_matches for p in around)) for one in (before, after))
-    if agree <= agreed:
-        return f"{len(bent)} images are bent, and of their matches {agree} agree with new places, {agreed} with the old"
-    lost = [p for p in around if before[p].share >= SOUND_SHARE and after[p].share < MIN_CONSENT]
+    around = [pair for pair in before if not set(pair).isdisjoint(wrong)]
+    old, new = (round(sum(one[p].inlier_fraction * one[p].num_matches for p in around)) for one in (before, after))
+    if new <= old:
+        return f"{new} matches fit the new poses, {old} the old"
+    lost = [
+        pair
+        for pair in around
+        if before[pair].inlier_fraction >= MIN_SUPPORTING_FRACTION and after[pair].inlier_fraction < MIN_INLIER_FRACTION
+    ]
     if lost:
-        return f"{len(bent)} images are bent, and new places contradict {len(lost)} pairs that agreed with the old"
-    still = set(bent) & set(bent_images(after, images))
-    return f"{len(bent)} images are bent, and {len(still)} of them also in new places" if still else ""
+        return f"the new poses contradict {len(lost)} pairs that fit the old"
+    still = set(wrong) & set(find_misregistered(after, images))
+    return f"{len(still)} are misregistered at the new poses, too" if still else ""
 
 
-def _report(bench: Bench, before: ModelFigures, poses: Mapping[int, FloatArray], reason: str) -> StepReport:
-    old = {bench.model.image(i + 1).frame_id: pycolmap.Rigid3d(pose) for i, pose in poses.items()}
-    return report_of(NAME, before, figures_of(bench.model), *movement(bench.model, old), reason)
-
-
+# ------------------------------------------------------------------- global mapping
 @dataclass(frozen=True, kw_only=True)
 class _MappingTask:
     database: Path
@@ -133,46 +139,42 @@ class _MappingTask:
     threads: int
 
 
-def _mapped_anew(
-    bench: Bench,
-    poses: Mapping[int, FloatArray],
-    bent: Collection[int],
-    features: MatchedFeatures,
-) -> dict[int, FloatArray]:
-    """(3, 4) ``cam_from_world`` of those bent images that the global mapper ties to their neighbours."""
-    together = {*bent, *_neighbours(bent, poses.keys(), features)}
+def map_with_neighbours(session: MapperSession, wrong: Collection[int]) -> dict[int, FloatArray]:
+    """(3, 4) ``cam_from_world`` of those of the images that the global mapper connects with their neighbours."""
+    poses, features = poses_of(session.model), session.features
+    together = {*wrong, *_neighbours(wrong, poses.keys(), features)}
     matches = {
         pair: rows for pair, rows in features.verified.items() if set(pair) <= together and len(rows) >= MIN_VERIFIED
     }
-    cameras = [replace(one, has_prior_focal=True) for one in cameras_of(bench.model, bench.collection.cameras)]
-    with tempfile.TemporaryDirectory(dir=bench.scratch) as folder:
-        task = _MappingTask(database=Path(folder) / "database.db", output=Path(folder), threads=bench.threads)
+    cameras = [replace(one, has_prior_focal=True) for one in cameras_of(session.model, session.collection.cameras)]
+    with tempfile.TemporaryDirectory(dir=session.scratch) as folder:
+        task = _MappingTask(database=Path(folder) / "database.db", output=Path(folder), threads=session.threads)
         write_colmap_database(
             task.database,
-            bench.collection,
+            session.collection,
             cameras,
             keypoints=features.keypoints,
             matches=matches,
             j_from_i={},
             priors=(),
         )
-        mapped = in_child(_map_globally, task)
-        if isinstance(mapped, TaskFailure):
-            logger.warning("the global mapper failed on %d bent images: %s", len(bent), mapped.reason)
+        succeeded = in_child(_map_globally, task)
+        if isinstance(succeeded, TaskFailure):
+            logger.warning("the global mapper failed on %d misregistered images: %s", len(wrong), succeeded.reason)
             return {}
-        if not mapped:
+        if not succeeded:
             return {}
-        anew = read_reference_sparse(task.output)
-    return _in_world_of(poses, anew, bent, [image.name for image in bench.collection.images])
+        mapped = read_reference_sparse(task.output)
+    return _in_world(mapped, poses, wrong, [image.name for image in session.collection.images])
 
 
 def _map_globally(task: _MappingTask) -> bool:
-    """In the child process: write the largest model; whether there is one."""
+    """In the child process: write the largest model; returns whether there is one."""
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads = options.mapper.num_threads = task.threads
     options.random_seed = options.mapper.random_seed = 0
     options.mapper.global_positioning.use_gpu = options.mapper.bundle_adjustment.ceres.use_gpu = False
-    # The model's intrinsics rest on more images than these.
+    # The model's intrinsics were adjusted on more images than these.
     options.mapper.bundle_adjustment.refine_focal_length = False
     options.mapper.bundle_adjustment.refine_extra_params = False
     models = pycolmap.global_mapping(task.database, task.output, task.output, options)
@@ -182,23 +184,30 @@ def _map_globally(task: _MappingTask) -> bool:
     return True
 
 
-def _in_world_of(
-    poses: Mapping[int, FloatArray], anew: Mapping[str, FloatArray], bent: Collection[int], names: Sequence[str]
+def _in_world(
+    world_from_cam: Mapping[str, FloatArray],
+    poses: Mapping[int, FloatArray],
+    wrong: Collection[int],
+    names: Sequence[str],
 ) -> dict[int, FloatArray]:
-    """The bent images' poses in the model's world, after a similarity that fits the neighbours' cameras."""
-    bulk = {names[i]: invert_rigid(pose) for i, pose in poses.items() if i not in bent}
+    """The mapped images' poses in the model's world, by a similarity that fits the neighbours' cameras."""
+    others = {names[i]: invert_rigid(pose) for i, pose in poses.items() if i not in wrong}
     try:
-        world_from_anew = compare_trajectories(anew, bulk).reference_from_estimated
+        world_from_mapped = compare_trajectories(world_from_cam, others).reference_from_estimated
     except DegenerateAlignmentError as error:
-        logger.info("bent images mapped anew have no place in the model: %s", error)
+        logger.info("misregistered images could not be aligned with the model: %s", error)
         return {}
-    return {i: invert_rigid(world_from_anew.move_cameras(anew[names[i]][None])[0]) for i in bent if names[i] in anew}
+    return {
+        i: invert_rigid(world_from_mapped.move_cameras(world_from_cam[names[i]][None])[0])
+        for i in wrong
+        if names[i] in world_from_cam
+    }
 
 
-def _neighbours(bent: Collection[int], images: Collection[int], features: MatchedFeatures) -> list[int]:
-    """Images of the bulk with most verified matches to bent ones, and those nearest to them in turn."""
-    counts = dict.fromkeys(sorted(set(images) - set(bent)), 0)
-    reached = set(bent)
+def _neighbours(wrong: Collection[int], images: Collection[int], features: MatchedFeatures) -> list[int]:
+    """The other images with most verified matches to the misregistered ones, and those nearest to them in turn."""
+    counts = dict.fromkeys(sorted(set(images) - set(wrong)), 0)
+    reached = set(wrong)
     for _ in range(2):
         for (i, j), rows in features.verified.items():
             for inside, outside in ((i, j), (j, i)):
@@ -206,8 +215,3 @@ def _neighbours(bent: Collection[int], images: Collection[int], features: Matche
                     counts[outside] += len(rows)
         reached |= set(sorted((i for i in counts if counts[i]), key=lambda i: -counts[i])[: MAX_NEIGHBOURS // 2])
     return sorted((i for i in counts if counts[i]), key=lambda i: -counts[i])[:MAX_NEIGHBOURS]
-
-
-def _agreements(bench: Bench, poses: Mapping[int, FloatArray], features: MatchedFeatures) -> dict[Pair, Agreement]:
-    shares = consent_shares(features, bench.views(poses), tolerance=TIGHT_PART, min_matches=MIN_MATCHES)
-    return {pair: Agreement(num_matches=len(features.verified[pair]), share=share) for pair, share in shares.items()}

@@ -1,10 +1,10 @@
-"""From a stitched model to one with real tracks and adjusted cameras: the stages and what they leave.
+"""From initial poses to a model with tracks and adjusted cameras.
 
-    track pairs      which images see the same surface            pair_selection
-    track matching   SIFT of the new pairs                        backbones.classical.features
-    refinement       triangulation, adjustment, in a child        task
+    track pairs      which images see the same surface            features.covisibility
+    track matching   SIFT matches of the new pairs                features.matching
+    refinement       triangulation and bundle adjustment          global_refinement, in a child process
 
-Whatever fails or comes out worse leaves the stitched model as it is, with a reason.
+If the refinement fails, the scene keeps its initial poses, with a reason. The next module to read is ``dense.stage``.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
 
 from smust3r_colmap.colmap.database import open_database
+from smust3r_colmap.colmap.reconstruction import cameras_of, poses_of
 from smust3r_colmap.config import FeatureConfig, RefinementConfig, SegmentationConfig, TrackConfig
 from smust3r_colmap.errors import ConfigError
 from smust3r_colmap.execution.progress import Stage
@@ -27,12 +27,10 @@ from smust3r_colmap.features.covisibility import SeenSurface, select_pairs
 from smust3r_colmap.features.seen_surfaces import seen_surfaces, surfaces_of_clouds, surfaces_of_maps
 from smust3r_colmap.features.stage import features_of_run, match_pairs_of_run
 from smust3r_colmap.geometry.arrays import FloatArray, Pair
-from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import EMPTY_CLOUD, DepthMaps, ImageCollection, RunFeatures, Scene
-from smust3r_colmap.refinement.acceptance import StepReport
-from smust3r_colmap.refinement.bundle_adjustment import ModelFigures
-from smust3r_colmap.refinement.global_refinement import STAYED, RefinedFigures, RefineTask, refine_scenes
-from smust3r_colmap.refinement.mapper import LOOSE_PART
+from smust3r_colmap.refinement.global_refinement import RESULTS, RefineTask, refine_scenes
+from smust3r_colmap.refinement.mapper import COARSE_TOLERANCE_FRACTION
+from smust3r_colmap.refinement.statistics import SceneRefinement
 from smust3r_colmap.segmentation.stage import Segments
 from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.segmentation.windows import plan_windows
@@ -42,17 +40,15 @@ from smust3r_colmap.storage.run_directory import (
     DATABASE_FILE,
     MODEL_FOLDER,
     REFINED_STAGE,
-    StageFolder,
     key_of,
-    read_json,
 )
 
 NEXT_IMAGES = 4
-"""Neighbours in order that are matched in any case where no backbone has matched them."""
-METHOD_VERSION = 5
+"""Neighbours in order that are always matched if the backbone has matched nothing."""
+METHOD_VERSION = 6
 """To be raised when the refinement changes, so that finished folders are refined again."""
 WORKERS_PER_THREAD = 2
-"""Adjustment gains little from threads: on two cores a second one cost 70 % more processor time and saved none."""
+"""Adjustment gains little from threads: on two cores a second one took 70 % more processor time and saved no time."""
 
 
 _PAIRS: Codec[tuple[Pair, ...]] = Codec(tuple[Pair, ...], "pairs")
@@ -60,19 +56,19 @@ _PAIRS: Codec[tuple[Pair, ...]] = Codec(tuple[Pair, ...], "pairs")
 
 @dataclass(frozen=True, kw_only=True)
 class Refinement:
-    """What came of the scenes.
+    """The results of all scenes.
 
     Args:
         folder: holds the models and the database.
         key: hash of all that they depend on.
-        scenes: with adjusted poses and cameras, without points; the stitched one where refinement failed.
-        figures: one per scene.
+        scenes: with adjusted poses and cameras, without points; the initial one if its refinement failed.
+        results: one per scene.
     """
 
     folder: Path
     key: str
     scenes: tuple[Scene, ...]
-    figures: tuple[RefinedFigures, ...]
+    results: tuple[SceneRefinement, ...]
 
     @property
     def database(self) -> Path:
@@ -81,8 +77,8 @@ class Refinement:
 
     @property
     def models(self) -> tuple[Path | None, ...]:
-        """Per scene the folder of its COLMAP model with tracks, or None where the stitched one was kept."""
-        return tuple(self._model(number) if one.kept else None for number, one in enumerate(self.figures))
+        """Per scene the folder of its COLMAP model with tracks, or None if its refinement failed."""
+        return tuple(self._model(number) if one.succeeded else None for number, one in enumerate(self.results))
 
     def _model(self, number: int) -> Path:
         return self.folder / str(number) / MODEL_FOLDER
@@ -90,16 +86,16 @@ class Refinement:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class InitialScenes:
-    """What refinement begins with.
+    """The input of the refinement.
 
     Args:
         scenes: largest first.
-        subsets: image indices of the segments, adjusted by themselves first where the model is large.
-        maps: depth of the scenes; None where the model came without.
+        subsets: image indices of the segments, which are adjusted first in large models.
+        maps: depth of the scenes; None if the model has none.
         maps_key: hash of all that the maps were made from.
-        surfaces: (S, 3) world points that each image sees, by image index; None where the maps or the points of
-            the scenes tell.
-        tolerance: how far poses may be off, as a fraction of the longer image side, in the first round.
+        surfaces: (S, 3) world points that each image sees, by image index; by default from the maps, or from the
+            points of the scenes.
+        tolerance: of the poses, as a fraction of the longer image side.
     """
 
     scenes: tuple[Scene, ...]
@@ -107,11 +103,11 @@ class InitialScenes:
     maps: DepthMaps | None = None
     maps_key: str = ""
     surfaces: Mapping[int, FloatArray] | None = None
-    tolerance: float = LOOSE_PART
+    tolerance: float = COARSE_TOLERANCE_FRACTION
 
     @classmethod
     def of(cls, stitched: Stitched, segments: Segments, *, maps_key: str) -> InitialScenes:
-        """What stitching placed."""
+        """The scenes of stitching."""
         windows = tuple(window.images for window in segments.windows)
         return cls(scenes=stitched.scenes, subsets=windows, maps=stitched.maps, maps_key=maps_key)
 
@@ -152,17 +148,17 @@ def refine(
     options: RefinementConfig,
     feature_options: FeatureConfig,
 ) -> Refinement | None:
-    """Find tracks across each scene and adjust it to them; None where that is not wanted.
+    """Build tracks in each scene and adjust it; None if it is switched off.
 
     Args:
         run: keeps what is finished.
-        initial: scenes with poses that are nearly right.
+        initial: scenes with initial poses.
         collection: all images of the run.
-        features: the run's SIFT; extracted here where the backbone has none.
+        features: the run's SIFT; extracted here if the backbone has none.
         options, feature_options: settings.
 
     Raises:
-        ConfigError: tracks of pointmaps are wanted and there are no maps.
+        ConfigError: tracks from pointmaps are requested and there are no maps.
     """
     if not options.refine:
         return None
@@ -191,20 +187,20 @@ def refine(
                 features=None if features is None else features.database,
                 maps=initial.maps if map_pairs else None,
                 map_pairs=map_pairs,
-                parts=initial.subsets,
+                segments=initial.subsets,
                 calibrated=collection.calibrated,
                 principal_point=options.principal_point,
                 threads=max(1, run.executor.workers // WORKERS_PER_THREAD),
                 tolerance=initial.tolerance,
-                complete=options.register_missing,
+                register_missing=options.register_missing,
             )
             outcome = in_child(refine_scenes, task, log_file=run.folder.native_log)
             stage.advance()
             if isinstance(outcome, TaskFailure):
-                run.clock.warn(f"no tracks, the stitched model is kept: {outcome.reason}")
-                return _not_refined(initial.scenes, stored, outcome.reason)
-    figures = tuple(_figures_from_json(facts) for facts in read_json(stored.path / "figures.json"))
-    refined = Refinement(folder=stored.path, key=stored.key, scenes=initial.scenes, figures=figures)
+                run.clock.warn(f"no tracks, the initial poses are kept: {outcome.reason}")
+                failed = tuple(SceneRefinement.failed(scene.image_names, outcome.reason) for scene in initial.scenes)
+                return Refinement(folder=stored.path, key=stored.key, scenes=initial.scenes, results=failed)
+    refined = Refinement(folder=stored.path, key=stored.key, scenes=initial.scenes, results=RESULTS.read(stored.path))
     adjusted = tuple(
         scene if model is None else _adjusted_scene(scene, model, collection)
         for scene, model in zip(initial.scenes, refined.models, strict=True)
@@ -220,30 +216,30 @@ def refine_external(
     options: TrackConfig,
     feature_options: FeatureConfig,
 ) -> Refinement:
-    """As ``refine``, with a warning where the poses may mean something else than COLMAP's.
+    """As ``refine``, with a warning if the poses may follow another convention than COLMAP's.
 
-    Poses of another convention look like any others, but hardly a match agrees with them.
+    Such poses look like any others, but few matches agree with them.
     """
     refinement = refine(run, initial, collection, features, RefinementConfig(**vars(options)), feature_options)
-    assert refinement is not None, "it was wanted"
-    (figures,) = refinement.figures
-    if figures.kept and figures.num_refused_pairs <= figures.num_pairs:
+    assert refinement is not None, "switched on"
+    (result,) = refinement.results
+    if result.succeeded and result.num_unverified_pairs <= result.num_pairs:
         return refinement
     warning = (
-        f"the matches of {figures.num_pairs} image pairs agree with the poses, those of {figures.num_refused_pairs} do "
-        "not; has the model camera centres in place of translations, or poses from camera to world? COLMAP's are "
+        f"the matches of {result.num_pairs} image pairs agree with the poses, those of {result.num_unverified_pairs} "
+        "do not; has the model camera centres in place of translations, or poses from camera to world? COLMAP's are "
         "from world to camera"
     )
     warned = (
-        replace(figures, warnings=(*figures.warnings, warning))
-        if figures.kept
-        else replace(figures, reason=f"{figures.reason}; {warning}")
+        replace(result, warnings=(*result.warnings, warning))
+        if result.succeeded
+        else replace(result, reason=f"{result.reason}; {warning}")
     )
-    return replace(refinement, figures=(warned,))
+    return replace(refinement, results=(warned,))
 
 
 def _match(run: Run, seen: Sequence[Sequence[SeenSurface]], features: RunFeatures, per_image: int) -> tuple[Pair, ...]:
-    """Match the pairs that the geometry suggests; returns all pairs that have been matched in the run."""
+    """Match the pairs that see the same surface; returns all pairs that have been matched in the run."""
     with open_database(features.database) as database:
         pair_ids, _ = database.read_all_matches()
     known = {(a - 1, b - 1) for a, b in map(pycolmap.pair_id_to_image_pair, pair_ids)}
@@ -258,10 +254,10 @@ def _wanted_pairs(
     known: Collection[Pair],
     per_image: int,
 ) -> tuple[Pair, ...]:
-    """What the geometry suggests beyond ``known``; stored, for at a second start the suggested pairs are known, too."""
+    """Pairs beyond ``known`` that see the same surface; stored, because at a second start they are known, too."""
 
     def compute(progress: Stage) -> tuple[Pair, ...]:
-        # A backbone without features has matched nothing yet, neither neighbours nor images without a pose.
+        # A backbone without features has matched nothing yet.
         near = set() if known else _next_images(range(len(features.usable)))
         wanted = set(near)
         for surfaces in seen:
@@ -274,7 +270,7 @@ def _wanted_pairs(
 
 
 def _pairs_for_maps(seen: Sequence[Sequence[SeenSurface]], per_image: int) -> tuple[Pair, ...]:
-    """The nearest neighbours in order, and the images of other passes that see the same surface."""
+    """Neighbours in order, and other images that see the same surface."""
     pairs: set[Pair] = set()
     for surfaces in seen:
         images = sorted(surface.image for surface in surfaces)
@@ -288,52 +284,17 @@ def _next_images(images: Sequence[int]) -> set[Pair]:
 
 # --------------------------------------------------------------------------- results
 def _adjusted_scene(scene: Scene, folder: Path, collection: ImageCollection) -> Scene:
-    """The scene as the model with tracks has it; images that were placed late are in it, too."""
+    """The scene with poses and cameras of the model, also of the images that the refinement registered."""
     model = pycolmap.Reconstruction(folder)
-    indices = tuple(i - 1 for i in sorted(model.reg_image_ids()))
-    images = [collection.images[i] for i in indices]
+    poses = poses_of(model)
+    images = [collection.images[i] for i in poses]
+    cameras = cameras_of(model, collection.cameras)
     return replace(
         scene,
-        image_indices=indices,
+        image_indices=tuple(poses),
         image_names=tuple(image.name for image in images),
         camera_indices=tuple(image.camera for image in images),
-        cameras={image.camera: Intrinsics.from_colmap(model.camera(image.camera + 1)) for image in images},
-        cam_from_world=np.stack([model.image(i + 1).cam_from_world().matrix() for i in indices]),
+        cameras={image.camera: cameras[image.camera] for image in images},
+        cam_from_world=np.stack(list(poses.values())),
         points=EMPTY_CLOUD,
     )
-
-
-def _not_refined(scenes: tuple[Scene, ...], stored: StageFolder, reason: str) -> Refinement:
-    def nothing(scene: Scene) -> RefinedFigures:
-        final = ModelFigures(
-            num_images=len(scene),
-            num_points=0,
-            num_observations=0,
-            mean_track_length=0.0,
-            reprojection_error_px=0.0,
-            num_weak=len(scene),
-        )
-        return RefinedFigures(
-            steps=(),
-            num_pairs=0,
-            num_matches=0,
-            num_refused_pairs=0,
-            weak=(),
-            registered=(),
-            final=final,
-            kept=False,
-            principal_point=STAYED,
-            warnings=(),
-            reason=reason,
-        )
-
-    return Refinement(folder=stored.path, key=stored.key, scenes=scenes, figures=tuple(map(nothing, scenes)))
-
-
-def _figures_from_json(facts: Mapping[str, Any]) -> RefinedFigures:
-    steps = tuple(
-        StepReport(**{**step, "before": ModelFigures(**step["before"]), "after": ModelFigures(**step["after"])})
-        for step in facts["steps"]
-    )
-    listed = {name: tuple(facts[name]) for name in ("weak", "registered", "warnings")}
-    return RefinedFigures(**{**facts, **listed, "steps": steps, "final": ModelFigures(**facts["final"])})

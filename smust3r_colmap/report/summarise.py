@@ -20,7 +20,7 @@ from smust3r_colmap.exporters.registry import Outputs
 from smust3r_colmap.importers.fitted_model import FittedModel
 from smust3r_colmap.products import Edges, FusedScene, ImageCollection, RunFeatures
 from smust3r_colmap.refinement.stage import Refinement
-from smust3r_colmap.report.summary import ImageNote, ModelSummary, RefinementStep, RefinementSummary, RunSummary
+from smust3r_colmap.report.summary import ImageNote, ModelSummary, RunSummary
 from smust3r_colmap.segmentation.stage import Segments
 from smust3r_colmap.stitching.stage import (
     CameraFusionSummary,
@@ -71,7 +71,7 @@ def reconstruction(
         loops_note=segments.loops.note,
         graph=summarise_graph(stitched.stitching),
         peak_memory_bytes=peak_memory_bytes(),
-        refinements=() if refinement is None else _refinements(run, refinement, collection),
+        refinements=() if refinement is None else refinement.results,
         missing_outputs=outputs.missing,
         notes=outputs.notes,
     )
@@ -104,7 +104,7 @@ def refined_model(
         loops_note="",
         graph=None,
         peak_memory_bytes=peak_memory_bytes(),
-        refinements=_refinements(run, refinement, fitted.collection),
+        refinements=refinement.results,
         missing_outputs=outputs.missing,
         notes=(*_note_on_points(fitted, is_refined=is_refined), *outputs.notes),
     )
@@ -170,46 +170,4 @@ def _note_on_points(fitted: FittedModel, *, is_refined: bool) -> tuple[str, ...]
     return (
         f"points.ply: {untracked} points of the given model have no track; they were moved with the cameras as a whole "
         "and are not in sparse/0",
-    )
-
-
-def _refinements(run: Run, refinement: Refinement, collection: ImageCollection) -> tuple[RefinementSummary, ...]:
-    """One per scene."""
-    return tuple(
-        RefinementSummary(
-            folder=run.folder.sparse_model(number).relative_to(run.folder.root).as_posix(),
-            kept=one.kept,
-            reason=one.reason,
-            num_points=one.final.num_points,
-            num_observations=one.final.num_observations,
-            mean_track_length=one.final.mean_track_length,
-            reprojection_error_px=one.final.reprojection_error_px,
-            num_pairs=one.num_pairs,
-            num_matches=one.num_matches,
-            num_refused_pairs=one.num_refused_pairs,
-            weak=tuple(collection.images[i].name for i in one.weak),
-            registered=tuple(collection.images[i].name for i in one.registered),
-            principal_point=one.principal_point,
-            warnings=one.warnings,
-            steps=tuple(
-                RefinementStep(
-                    name=step.name,
-                    observations_before=step.before.num_observations,
-                    observations_after=step.after.num_observations,
-                    error_before_px=step.before.reprojection_error_px,
-                    error_after_px=step.after.reprojection_error_px,
-                    track_length_before=step.before.mean_track_length,
-                    track_length_after=step.after.mean_track_length,
-                    images_before=step.before.num_images,
-                    images_after=step.after.num_images,
-                    moved_percent=step.moved_percent,
-                    max_moved_percent=step.max_moved_percent,
-                    turned_deg=step.turned_deg,
-                    kept=step.kept,
-                    reason=step.reason,
-                )
-                for step in one.steps
-            ),
-        )
-        for number, one in enumerate(refinement.figures)
     )

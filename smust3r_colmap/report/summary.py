@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # the command line imports this module, and shall not load nu
     from smust3r_colmap.backbones.stage import SegmentSummary
     from smust3r_colmap.exporters.registry import MissingOutput
     from smust3r_colmap.products import CloudStatistics
+    from smust3r_colmap.refinement.statistics import SceneRefinement
     from smust3r_colmap.stitching.stage import CameraFusionSummary, GraphSummary, LoopSummary
 
 SCHEMA_VERSION = 2
@@ -63,71 +64,6 @@ class ImageNote:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefinementStep:
-    """What one step of the refinement did to a model.
-
-    Args:
-        name: of the step.
-        observations_before, observations_after: of tracks of two images or more.
-        error_before_px, error_after_px: mean reprojection error of the points.
-        track_length_before, track_length_after: observations per point.
-        images_before, images_after: registered.
-        moved_percent, max_moved_percent: median and largest of the cameras, in percent of the path's extent.
-        turned_deg: median of the cameras.
-        kept: the step stands. reason: why it was undone, or empty.
-    """
-
-    name: str
-    observations_before: int
-    observations_after: int
-    error_before_px: float
-    error_after_px: float
-    track_length_before: float
-    track_length_after: float
-    images_before: int
-    images_after: int
-    moved_percent: float
-    max_moved_percent: float
-    turned_deg: float
-    kept: bool
-    reason: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class RefinementSummary:
-    """Tracks and bundle adjustment of one model.
-
-    Args:
-        folder: of the model, as in ``ModelSummary``.
-        kept: the model has tracks and adjusted cameras. reason: why not, or empty.
-        num_points, num_observations, mean_track_length, reprojection_error_px: of the model with tracks.
-        num_pairs, num_matches: image pairs with tracks, and their matches.
-        num_refused_pairs: verified pairs that contradict the stitched geometry, such as look-alike places.
-        weak: images with fewer than 15 observations, which keep their stitched place.
-        registered: images that had no pose before.
-        principal_point: whether it was freed, and why not, in words; empty where that was never asked.
-        warnings: what speaks against a model that has tracks, in words.
-        steps: in order.
-    """
-
-    folder: str
-    kept: bool
-    reason: str
-    num_points: int
-    num_observations: int
-    mean_track_length: float
-    reprojection_error_px: float
-    num_pairs: int
-    num_matches: int
-    num_refused_pairs: int
-    weak: tuple[str, ...]
-    registered: tuple[str, ...]
-    principal_point: str
-    warnings: tuple[str, ...]
-    steps: tuple[RefinementStep, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
 class RunSummary:
     """The whole run.
 
@@ -144,7 +80,7 @@ class RunSummary:
         loops: that were planned. loops_note: why none could be looked for, or empty.
         graph: the optimisation of the frames of all submodels; None where nothing was stitched.
         peak_memory_bytes: largest resident size of this process or of one of its children.
-        refinements: one per model; empty where none was wanted.
+        refinements: one per model, in their order; empty if refinement was switched off.
         missing_outputs: parts of the result that could not be written.
         notes: what was left out of those that were written.
 
@@ -165,7 +101,7 @@ class RunSummary:
     loops_note: str
     graph: GraphSummary | None
     peak_memory_bytes: int
-    refinements: tuple[RefinementSummary, ...] = ()
+    refinements: tuple[SceneRefinement, ...] = ()
     missing_outputs: tuple[MissingOutput, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -213,12 +149,14 @@ class RunSummary:
                 f"the geometry of {len(doubted)} of {len(self.segments)} segments should not be trusted, such as "
                 f"segment {doubted[0].index}: {doubted[0].warnings[0]}"
             )
-        if self.refinements and not self.refinements[0].kept:
+        if self.refinements and not self.refinements[0].succeeded:
             reasons.append(f"the largest model has no tracks: {self.refinements[0].reason}")
-        num_weak = sum(len(one.weak) for one in self.refinements if one.kept)
+        folders = [model.folder for model in self.models]
+        refined = [(name, one) for name, one in zip(folders, self.refinements, strict=False) if one.succeeded]
+        num_weak = sum(len(one.weak) for _, one in refined)
         if num_weak:
-            reasons.append(f"{num_weak} images rest on fewer than 15 observations; they keep their stitched place")
-        reasons += [f"{one.folder}: {doubt}" for one in self.refinements if one.kept for doubt in one.warnings]
+            reasons.append(f"{num_weak} images have too few observations; they keep their initial pose")
+        reasons += [f"{folder}: {warning}" for folder, one in refined for warning in one.warnings]
         reasons += [f"no {one.name}: {one.reason}" for one in self.missing_outputs]
         return tuple(reasons)
 
@@ -246,7 +184,8 @@ class RunSummary:
         lines = [f"{self.num_registered} of {self.num_images} images have a pose. Scale: {self.scale_statement}."]
         lines += [f"  {_model_line(model)}" for model in self.models]
         lines += _loop_lines(self.loops, self.loops_note)
-        lines += [line for one in self.refinements for line in _refinement_lines(one)]
+        for model, one in zip(self.models, self.refinements, strict=False):
+            lines += _refinement_lines(model.folder, one)
         lines += _remark_lines("without a pose", self.unregistered)
         lines += _remark_lines("left out", self.rejected)
         lines += [f"  {note}" for note in self.notes]
@@ -269,20 +208,20 @@ def _model_line(model: ModelSummary) -> str:
     return f"{model.folder}: {model.num_images} images, {model.num_points} points, {segments}"
 
 
-def _refinement_lines(one: RefinementSummary) -> list[str]:
-    if not one.kept:
-        return [f"  {one.folder}: no tracks ({one.reason})"]
+def _refinement_lines(folder: str, one: SceneRefinement) -> list[str]:
+    if not one.succeeded:
+        return [f"  {folder}: no tracks ({one.reason})"]
+    found = one.statistics
     lines = [
-        f"  {one.folder}: {one.num_observations} observations of {one.num_points} points "
-        f"(track length {one.mean_track_length:.2f}), reprojection error {one.reprojection_error_px:.2f} px"
+        f"  {folder}: {found.num_observations} observations of {found.num_points} points "
+        f"(track length {found.mean_track_length:.2f}), reprojection error {found.reprojection_error_px:.2f} px",
+        f"  {folder}: principal point {one.principal_point}",
     ]
-    if one.principal_point:
-        lines.append(f"  {one.folder}: principal point {one.principal_point}")
-    lines += [f"  {one.folder}: {step.name} undone, {step.reason}" for step in one.steps if not step.kept]
-    for what, names in (("few observations", one.weak), ("placed by the refinement", one.registered)):
+    lines += [f"  {folder}: {step.name} rejected, {step.reason}" for step in one.steps if not step.accepted]
+    for what, names in (("few observations", one.weak), ("registered by the refinement", one.registered)):
         if names:
             more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
-            lines.append(f"  {one.folder}: {what}: {', '.join(names[:_NAMES_SHOWN])}{more}")
+            lines.append(f"  {folder}: {what}: {', '.join(names[:_NAMES_SHOWN])}{more}")
     return lines
 
 

@@ -20,7 +20,7 @@
         alignment/         edges between the submodels
         stitched/          cameras as stitching placed them, one depth map per image
         track_pairs/       image pairs that the stitched geometry suggests for tracks
-        refined/           0/model  1/model ...  database.db  figures.json
+        refined/           0/model  1/model ...  database.db  refinements.json
         scene/             the adjusted cameras and fused clouds, before they are exported
         finished.json      when all stages stand: which of them belong together, and where the images are
 

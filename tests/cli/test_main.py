@@ -33,9 +33,9 @@ from smust3r_colmap.execution.progress import (
     reporter_for,
 )
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.refinement.statistics import SceneRefinement
 from smust3r_colmap.report.summary import (
     ImageNote,
-    RefinementSummary,
     RunSummary,
 )
 from smust3r_colmap.synthetic.room import demo_intrinsics
@@ -97,22 +97,10 @@ def test_good_run_exits_0_with_the_summary_on_stdout(
     assert (call.images, call.output, call.overwrite) == (Path("photos"), Path("out"), True)
 
 
-REFINED = RefinementSummary(
-    folder="sparse/0",
-    kept=True,
-    reason="",
-    num_points=100,
-    num_observations=300,
-    mean_track_length=3.0,
-    reprojection_error_px=0.5,
-    num_pairs=10,
-    num_matches=300,
-    num_refused_pairs=0,
-    weak=(),
-    registered=(),
-    principal_point="",
-    warnings=(),
-    steps=(),
+REFINED = replace(
+    SceneRefinement.failed([f"{k}.jpg" for k in range(GOOD.models[0].num_images)], ""),
+    succeeded=True,
+    principal_point="fixed: as requested",
 )
 WEAK = replace(GOOD, num_registered=4, unregistered=(ImageNote(name="a.jpg", reason="too few matches"),))
 
@@ -497,14 +485,14 @@ def test_metric_needs_every_model() -> None:
             "nothing came out of segment 7",
         ),
         (
-            replace(GOOD, refinements=(replace(REFINED, warnings=("no adjustment stood: it diverged",)),)),
-            "sparse/0: no adjustment stood: it diverged",
+            replace(GOOD, refinements=(replace(REFINED, warnings=("no bundle adjustment accepted",)),)),
+            "sparse/0: no bundle adjustment accepted",
         ),
         (
-            replace(GOOD, refinements=(replace(REFINED, kept=False, reason="no point"),)),
+            replace(GOOD, refinements=(replace(REFINED, succeeded=False, reason="no point"),)),
             "the largest model has no tracks: no point",
         ),
-        (replace(GOOD, refinements=(replace(REFINED, weak=("a.jpg",)),)), "1 images rest on fewer than 15"),
+        (replace(GOOD, refinements=(replace(REFINED, weak=("a.jpg",)),)), "1 images have too few observations"),
     ],
 )
 def test_each_shortcoming_makes_the_result_weak(summary: RunSummary, reason: str) -> None:

@@ -150,12 +150,12 @@ def test_the_result_has_one_camera_at_the_size_of_the_photographs(result: RunSum
 def test_tracks_are_real_and_the_summary_counts_them(result: RunSummary) -> None:
     model = pycolmap.Reconstruction(result.output / "sparse/0")
     assert min(point.track.length() for point in model.points3D.values()) >= 2
-    (figures,) = json.loads((result.output / "summary.json").read_text())["refinements"]
-    assert figures["num_points"] == model.num_points3D() > 100
-    assert figures["steps"][0]["name"] == "triangulation"
+    (refined,) = json.loads((result.output / "summary.json").read_text())["refinements"]
+    assert refined["statistics"]["num_points"] == model.num_points3D() > 100
+    assert refined["steps"][0]["name"] == "triangulation"
     assert "principal point kept" in result.render_text() or "principal point free" in result.render_text()
-    assert figures["principal_point"] in result.render_text()
-    adjustments = [step for step in figures["steps"] if "adjustment" in step["name"]]
+    assert refined["principal_point"] in result.render_text()
+    adjustments = [step for step in refined["steps"] if "adjustment" in step["name"]]
     assert adjustments[0]["error_after_px"] < adjustments[0]["error_before_px"]
 
 
@@ -199,12 +199,12 @@ def test_the_settings_can_be_given_back(export: Export, result: RunSummary) -> N
 def test_the_given_cloud_comes_along_with_the_cameras(export: Export, result: RunSummary) -> None:
     """Its points are those of the true surface, so they must lie there again, seen from the refined cameras."""
     cloud = read_ply(result.output / "points.ply").xyz
-    (figures,) = result.refinements
+    (refined,) = result.refinements
     given = np.array([line.split()[1:4] for line in (export.model / "points3D.txt").read_text().splitlines()], float)
-    assert len(cloud) == figures.num_points + len(given) == result.models[0].num_points
+    assert len(cloud) == refined.statistics.num_points + len(given) == result.models[0].num_points
     truth_from_result = export.error_of(result.output / "sparse/0").reference_from_estimated
-    off = np.linalg.norm(truth_from_result.apply(cloud[figures.num_points :]) - given, axis=1)
-    assert np.linalg.norm(cloud[figures.num_points :] - given, axis=1).min() > 1e-4
+    off = np.linalg.norm(truth_from_result.apply(cloud[refined.statistics.num_points :]) - given, axis=1)
+    assert np.linalg.norm(cloud[refined.statistics.num_points :] - given, axis=1).min() > 1e-4
     assert 0 < np.median(off) < 0.03
     assert f"{len(given)} points of the given model have no track" in result.render_text()
 

@@ -75,7 +75,7 @@ def test_fountain_reads_back_with_its_true_size_and_focal_length(fountain: tuple
     assert (camera.width, camera.height) == (1024, 683)
     assert camera.params[0] == pytest.approx(920.7, rel=0.01)  # the set's own calibration
     ours = pycolmap.Reconstruction(summary.output / "sparse/0")
-    assert ours.num_points3D() == summary.refinements[0].num_points > 2_000
+    assert ours.num_points3D() == summary.refinements[0].statistics.num_points > 2_000
     assert min(point.track.length() for point in ours.points3D.values()) >= 2
     assert ours.compute_mean_track_length() > 4
     assert summary.models[0].num_points > 50_000
@@ -139,4 +139,4 @@ def test_the_loop_round_a_courtyard_is_found_and_closed(data_dir: Callable[[str]
     assert np.degrees(np.arccos(ends[0][:, 2] @ ends[1][:, 2])) < 40
     assert summary.num_registered == found.num_compared == 30
     assert found.position_rmse_percent < 0.3
-    assert summary.refinements[0].num_refused_pairs > 10  # look-alike windows of the facades
+    assert summary.refinements[0].num_unverified_pairs > 10  # look-alike windows of the facades

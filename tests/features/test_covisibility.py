@@ -9,8 +9,8 @@ import pytest
 from helpers.tracked_scenes import CAMERA, arc, cam_from_world_towards, straight
 
 from smust3r_colmap.features.covisibility import (
-    MIN_SCORE,
-    SAME_PLACE,
+    MIN_COVISIBILITY,
+    SAME_PLACE_IMAGES,
     SeenSurface,
     covisibility,
     sample_rows,
@@ -41,7 +41,7 @@ def walk_and_back(num_each: int) -> list[SeenSurface]:
     return [sees_wall(k, pose) for k, pose in enumerate([*there, *back])]
 
 
-def test_score_of_parallel_views_is_the_part_of_the_wall_that_both_see() -> None:
+def test_score_of_parallel_views_is_the_fraction_of_the_wall_that_both_see() -> None:
     surfaces = walk_and_back(6)
     scores = covisibility(surfaces[:6]).toarray()
     width_m = WALL_Z * CAMERA.width / CAMERA.focal_px
@@ -51,7 +51,7 @@ def test_score_of_parallel_views_is_the_part_of_the_wall_that_both_see() -> None
         assert abs(found - expected) < 0.1, f"{step} steps apart: {found:.2f}, of the wall {expected:.2f}"
     np.testing.assert_array_equal(scores, scores.T)
     assert (np.diag(scores) == 0).all()
-    assert scores[scores > 0].min() >= MIN_SCORE
+    assert scores[scores > 0].min() >= MIN_COVISIBILITY
 
 
 def test_images_of_the_two_sides_of_a_wall_share_nothing() -> None:
@@ -114,7 +114,7 @@ def test_an_image_passes_over_what_is_next_in_order_to_its_partners() -> None:
     """Image 1 was matched with 22, so 0 is no news for 22; and 22 none for image 0, which was matched with 23."""
     surfaces = walk_and_back(12)
     few = [surfaces[image] for image in (0, 1, 22, 23)]
-    assert SAME_PLACE == 2
+    assert SAME_PLACE_IMAGES == 2
     assert select_pairs([few[0], few[2]], per_image=4, known=()) == ((0, 22),)
     assert select_pairs(few, per_image=4, known=[(0, 1), (0, 23), (1, 22), (22, 23)]) == ()
 
@@ -136,7 +136,7 @@ def test_points_behind_or_beyond_the_lens_model_do_no_harm() -> None:
     assert np.isfinite(covisibility(both).toarray()).all()
 
 
-def test_images_keep_their_numbers_where_some_of_the_collection_are_missing() -> None:
+def test_images_keep_their_indices_if_some_of_the_collection_are_missing() -> None:
     surfaces = [sees_wall(image, pose) for image, pose in zip((3, 10, 17), arc(3, angle=0.1), strict=True)]
     assert set(select_pairs(surfaces, per_image=2, known=())) == {(3, 10), (3, 17), (10, 17)}
 

@@ -168,7 +168,7 @@ def test_every_keypoint_is_matched_and_none_is_there_twice(found: Correspondence
         assert apart.min() > 0.75
 
 
-def test_bundle_adjustment_learns_from_them(
+def test_bundle_adjustment_gains_accuracy_from_them(
     found: Correspondences, photos: list[Photo], views: list[MappedView], tmp_path: Path
 ) -> None:
     """Camera centres from centimetres to a tenth of a millimetre, reprojection from pixels to hundredths."""
@@ -297,7 +297,7 @@ def test_images_of_other_sizes_and_maps_of_other_sizes_match(room: DemoScene, ph
     assert (errors < 1.5).mean() > 0.95
 
 
-def test_a_camera_that_only_turned_is_matched_too(room: DemoScene, photos: list[Photo]) -> None:
+def test_a_camera_that_only_rotated_is_matched_too(room: DemoScene, photos: list[Photo]) -> None:
     """There is no parallax to triangulate, which is for the triangulation to find."""
     pose = room.camera_path(STEPS)[0].copy()
     pose[:, :3] = pose[:, :3] @ Rotation.from_euler("yz", [12, 5], degrees=True).as_matrix()
@@ -309,7 +309,7 @@ def test_a_camera_that_only_turned_is_matched_too(room: DemoScene, photos: list[
 
 
 # ----------------------------------------------------------------------- contradictions
-def test_an_image_that_stands_elsewhere_is_matched_with_nothing(photos: list[Photo]) -> None:
+def test_an_image_of_another_place_is_matched_with_nothing(photos: list[Photo]) -> None:
     """Its depth says that it sees the same walls; its pixels do not show them there."""
     elsewhere = photos[9].view(2, cam_from_world=photos[1].cam_from_world, depth=photos[1].depth)
     views = [photos[0].view(0), photos[1].view(1), elsewhere]
@@ -323,7 +323,7 @@ def test_depths_that_disagree_are_not_matched(photos: list[Photo]) -> None:
     assert not match_by_pointmaps([photos[0].view(0), deeper], [(0, 1)], max_keypoints=300).matches
 
 
-def test_only_confident_pixels_carry_corners(photos: list[Photo]) -> None:
+def test_corners_are_transferred_by_confident_depth_only(photos: list[Photo]) -> None:
     confidence = np.full((HEIGHT, WIDTH), 5, np.float32)
     confidence[:, : WIDTH // 2] = 1
     found = match_by_pointmaps(

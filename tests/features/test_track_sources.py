@@ -79,16 +79,16 @@ def refined(room: Room, output: Path, source: TrackSource) -> Refinement:
 @pytest.mark.parametrize("source", ["features", "pointmaps", "both"])
 def test_tracks_of_every_source_bring_the_cameras_to_the_truth(source: TrackSource, room: Room, tmp_path: Path) -> None:
     result = refined(room, tmp_path / "out", source)
-    (figures,), (folder,) = result.figures, result.models
+    (refinement,), (folder,) = result.results, result.models
     assert folder is not None
-    assert figures.weak == ()
+    assert refinement.weak == ()
     model = pycolmap.Reconstruction(folder)
     assert min(point.track.length() for point in model.points3D.values()) >= 2
     before = {f"{k}.png": pose for k, pose in enumerate(invert_rigid(room.stitched))}
     after = {image.name: image.cam_from_world().inverse().matrix() for image in model.images.values() if image.has_pose}
     assert room.error_of(after) < room.error_of(before) / 3
     # Only features can say where an image without depth stands.
-    assert figures.registered == (() if source == "pointmaps" else (WITHOUT_POSE,))
+    assert refinement.registered == (() if source == "pointmaps" else (f"{WITHOUT_POSE}.png",))
     with pycolmap.Database.open(result.database) as database:
         assert all(database.num_keypoints_for_image(k + 1) for k in range(WITHOUT_POSE))
     again = tmp_path / "triangulated"

@@ -34,7 +34,8 @@ from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.importers.image_folder import collection_from_scan, scan_image_folder
 from smust3r_colmap.importers.image_scan import RECORDS
 from smust3r_colmap.products import FusedScene, ImageCollection, PointCloud
-from smust3r_colmap.refinement.global_refinement import RefinedFigures, RefineTask, refine_scenes
+from smust3r_colmap.refinement.global_refinement import RefineTask, refine_scenes
+from smust3r_colmap.refinement.statistics import SceneRefinement
 from smust3r_colmap.storage.depth_maps import DepthMapWriter, StoredDepthMaps
 from smust3r_colmap.storage.run_directory import DATABASE_FILE, MODEL_FOLDER, RunDirectory, key_of
 from smust3r_colmap.storage.scenes import FUSED_SCENES
@@ -56,7 +57,7 @@ class Example:
     root: Path
     images: Path
     world: World
-    figures: RefinedFigures
+    result: SceneRefinement
 
     @property
     def model(self) -> pycolmap.Reconstruction:
@@ -75,12 +76,12 @@ def make_finished_run(folder: Path) -> Example:
         with run.stage("import", key=key_of("import")).write() as stage:
             RECORDS.write(stage, scan.records)
         collection = collection_from_scan(scan, CameraConfig())
-        figures = refine_corner(run, collection, world, placed=range(NUM_PLACED))
+        result = refine_corner(run, collection, world, placed=range(NUM_PLACED))
         finished = _store(run, collection, world, images)
         for name in ("sparse", "database", "ply", "dense"):
             FORMATS[name].write(finished, FormatSettings())
         write_finished(run, finished)
-    return Example(root=folder / "run", images=images, world=world, figures=figures)
+    return Example(root=folder / "run", images=images, world=world, result=result)
 
 
 def corner_of_a_room() -> World:
@@ -95,8 +96,13 @@ def corner_of_a_room() -> World:
 
 
 def refine_corner(
-    run: RunDirectory, collection: ImageCollection, world: World, *, placed: Collection[int], complete: bool = False
-) -> RefinedFigures:
+    run: RunDirectory,
+    collection: ImageCollection,
+    world: World,
+    *,
+    placed: Collection[int],
+    register_missing: bool = False,
+) -> SceneRefinement:
     """The stage ``refined`` of ``placed`` images; all but the last two of the collection have matches."""
     features = run.work / "features.db"
     matched = {pair: true_matches(world, pair) for pair in combinations(range(NUM_PLACED), 2)}
@@ -110,14 +116,14 @@ def refine_corner(
         features=features,
         maps=None,
         map_pairs=(),
-        parts=(tuple(placed),),
+        segments=(tuple(placed),),
         calibrated=False,
         principal_point=False,
         threads=1,
-        complete=complete,
+        register_missing=register_missing,
     )
-    (figures,) = refine_scenes(task)
-    return figures
+    (result,) = refine_scenes(task)
+    return result
 
 
 def _store(run: RunDirectory, collection: ImageCollection, world: World, images: Path) -> FinishedRun:

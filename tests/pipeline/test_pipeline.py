@@ -148,7 +148,7 @@ def test_the_model_is_read_by_an_independent_reader(finished: RunSummary) -> Non
     ours = pycolmap.Reconstruction(finished.output / "sparse/0")
     assert sorted(image.name for image in model.images.values()) == [f"{k:06d}.jpg" for k in range(NUM_IMAGES)]
     assert {i: image.name for i, image in model.images.items()} == {i: f"{i - 1:06d}.jpg" for i in model.images}
-    assert len(model.points) == len(ours.points3D) == finished.refinements[0].num_points
+    assert len(model.points) == len(ours.points3D) == finished.refinements[0].statistics.num_points
     assert (finished.output / "sparse/0/images.txt").is_file()
 
 

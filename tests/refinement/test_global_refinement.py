@@ -1,4 +1,4 @@
-"""Refinement start to end on scenes with known truth: what it makes better, what it leaves, what it reports."""
+"""Refinement from start to end on scenes with known truth: accuracy, what is kept, what is reported."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing import active_children
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -44,17 +43,17 @@ from smust3r_colmap.config import FeatureConfig, RefinementConfig
 from smust3r_colmap.errors import ConfigError
 from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.features import stage as features_stage
-from smust3r_colmap.features.seen_surfaces import GRID, surfaces_of_clouds
+from smust3r_colmap.features.seen_surfaces import GRID_CELLS, surfaces_of_clouds
 from smust3r_colmap.geometry.arrays import FloatArray, Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import ImageCollection, PointCloud, RunFeatures, Scene
-from smust3r_colmap.refinement import bundle_adjustment as adjustment
-from smust3r_colmap.refinement import global_refinement as task
+from smust3r_colmap.refinement import bundle_adjustment, mapper, statistics
 from smust3r_colmap.refinement import stage as refine
-from smust3r_colmap.refinement.bundle_adjustment import ENOUGH_OBSERVATIONS, MANY_OBSERVATIONS, figures_of
-from smust3r_colmap.refinement.global_refinement import RefinedFigures, RefineTask, refine_scenes
-from smust3r_colmap.refinement.mapper import Bench
+from smust3r_colmap.refinement.bundle_adjustment import WELL_CONSTRAINED_OBSERVATIONS
+from smust3r_colmap.refinement.global_refinement import RefineTask, refine_scenes
+from smust3r_colmap.refinement.mapper import redundant_points
 from smust3r_colmap.refinement.stage import InitialScenes, Refinement
+from smust3r_colmap.refinement.statistics import MIN_OBSERVATIONS, SceneRefinement, Statistics
 from smust3r_colmap.storage.run_directory import StageFolder, read_json
 
 pytestmark = pytest.mark.usefixtures("quiet_pycolmap")
@@ -70,13 +69,16 @@ Rows = npt.NDArray[np.uint32]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Refined:
-    """A world, what stitching is said to have made of it, and what refinement did."""
+    """A world, its initial poses, and the results of the refinement."""
 
     world: World
     collection: ImageCollection
     stitched: FloatArray
     folder: Path
-    figures: tuple[RefinedFigures, ...]
+    results: tuple[SceneRefinement, ...]
+
+    def names(self, *images: int) -> tuple[str, ...]:
+        return tuple(self.collection.images[i].name for i in images)
 
     def model(self, number: int = 0) -> pycolmap.Reconstruction:
         return pycolmap.Reconstruction(self.folder / str(number) / "model")
@@ -97,7 +99,7 @@ def refine_task(folder: Path, collection: ImageCollection, scenes: tuple[Scene, 
         features=folder / "features.db",
         maps=None,
         map_pairs=(),
-        parts=(),
+        segments=(),
         calibrated=collection.calibrated,
         threads=1,
     )
@@ -110,7 +112,7 @@ def refined(
     *,
     scenes: Sequence[Iterable[int]] | None = None,
     calibrated: bool = False,
-    parts: tuple[tuple[int, ...], ...] = (),
+    segments: tuple[tuple[int, ...], ...] = (),
     camera: Intrinsics = CAMERA,
 ) -> Refined:
     """Of true matches between neighbours."""
@@ -119,8 +121,8 @@ def refined(
     write_features(folder / "features.db", collection, world, verified={p: true_matches(world, p) for p in pairs})
     groups = [range(len(world))] if scenes is None else scenes
     made = tuple(stitched_scene(collection, stitched, group) for group in groups)
-    figures = refine_scenes(replace(refine_task(folder, collection, made), parts=parts))
-    return Refined(world=world, collection=collection, stitched=stitched, folder=folder / "refined", figures=figures)
+    results = refine_scenes(replace(refine_task(folder, collection, made), segments=segments))
+    return Refined(world=world, collection=collection, stitched=stitched, folder=folder / "refined", results=results)
 
 
 def num_right(world: World, pair: Pair, rows: Rows) -> int:
@@ -153,7 +155,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Refined:
     point_of = list(world.point_of)
     matched = np.flatnonzero(point_of[WEAK] >= 0)
     point_of[WEAK] = np.where(
-        np.isin(np.arange(len(point_of[WEAK])), matched[: ENOUGH_OBSERVATIONS - 3]), point_of[WEAK], -1
+        np.isin(np.arange(len(point_of[WEAK])), matched[: MIN_OBSERVATIONS - 3]), point_of[WEAK], -1
     )
     world = replace(world, point_of=tuple(point_of))
     stitched = disturbed(world.cam_from_world, rng, position=0.006 * world.extent, rotation_deg=0.4)
@@ -174,8 +176,8 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Refined:
         without_features={BLIND},
     )
     scene = stitched_scene(collection, stitched, [i for i in range(NUM_IMAGES) if i != WITHOUT_POSE])
-    figures = refine_scenes(refine_task(folder, collection, (scene,)))
-    return Refined(world=world, collection=collection, stitched=stitched, folder=folder / "refined", figures=figures)
+    results = refine_scenes(refine_task(folder, collection, (scene,)))
+    return Refined(world=world, collection=collection, stitched=stitched, folder=folder / "refined", results=results)
 
 
 def small_world(seed: int = 5, num_images: int = 7) -> tuple[World, FloatArray]:
@@ -198,32 +200,32 @@ def test_disturbed_poses_come_back_to_the_truth(walk: Refined) -> None:
     assert abs(scale - 1) < 0.005, "what the stitched cameras know of it"
 
 
-def test_figures_are_those_of_the_stored_model_and_tell_the_steps(walk: Refined) -> None:
-    (figures,) = walk.figures
-    assert figures.kept
-    assert figures.reason == ""
-    read_back = figures_of(walk.model())
-    assert read_back.reprojection_error_px == pytest.approx(figures.final.reprojection_error_px)
-    assert replace(read_back, reprojection_error_px=0) == replace(figures.final, reprojection_error_px=0)
-    assert 0.2 < figures.final.reprojection_error_px < 0.6
-    assert figures.final.mean_track_length > 5
-    names = [step.name for step in figures.steps]
-    assert names[:2] == ["triangulation", "adjustment"]
-    assert "second adjustment" in names
-    assert names[-1] == "last adjustment"
-    by_name = {step.name: step for step in figures.steps}
-    first = by_name["adjustment"]
+def test_statistics_are_those_of_the_stored_model_and_every_step_is_reported(walk: Refined) -> None:
+    (result,) = walk.results
+    assert result.succeeded
+    assert result.reason == ""
+    read_back = Statistics.of(walk.model())
+    assert read_back.reprojection_error_px == pytest.approx(result.statistics.reprojection_error_px)
+    assert replace(read_back, reprojection_error_px=0) == replace(result.statistics, reprojection_error_px=0)
+    assert 0.2 < result.statistics.reprojection_error_px < 0.6
+    assert result.statistics.mean_track_length > 5
+    names = [step.name for step in result.steps]
+    assert names[:2] == ["triangulation", "bundle adjustment"]
+    assert "second bundle adjustment" in names
+    assert names[-1] == "final bundle adjustment"
+    by_name = {step.name: step for step in result.steps}
+    first = by_name["bundle adjustment"]
     assert first.before.reprojection_error_px > 5 * first.after.reprojection_error_px
     assert 0.3 < first.moved_percent < 3
     assert 0.1 < first.turned_deg < 1
-    assert all(step.kept for step in figures.steps)
-    stored = read_json(walk.folder / "figures.json")
-    assert refine._figures_from_json(stored[0]) == figures, "what a second start reads"
+    assert all(step.accepted for step in result.steps)
+    stored = read_json(walk.folder / "refinements.json")
+    assert [step["name"] for step in stored[0]["steps"]] == names
 
 
-def test_look_alike_pair_is_refused_and_leaves_no_track(walk: Refined) -> None:
-    (figures,) = walk.figures
-    assert figures.num_refused_pairs == 1
+def test_look_alike_pair_is_rejected_and_leaves_no_track(walk: Refined) -> None:
+    (result,) = walk.results
+    assert result.num_unverified_pairs == 1
     assert LOOK_ALIKE not in walk.matches()
     first_ghost = len(walk.world.keypoints[13]) - int((walk.world.point_of[13] == -1).sum()) + 20
     points = walk.model().image(14).points2D
@@ -231,7 +233,7 @@ def test_look_alike_pair_is_refused_and_leaves_no_track(walk: Refined) -> None:
     assert sum(point.has_point3D() for point in points) > 60
 
 
-def test_raw_matches_of_unverified_pairs_are_used_as_far_as_the_geometry_consents(walk: Refined) -> None:
+def test_raw_matches_of_pairs_without_verification_are_used_if_they_agree_with_the_geometry(walk: Refined) -> None:
     matches = walk.matches()
     others = [i for i in SOUND if 0 < abs(i - UNVERIFIED) <= REACH]
     for pair in [(min(i, UNVERIFIED), max(i, UNVERIFIED)) for i in others]:
@@ -239,19 +241,19 @@ def test_raw_matches_of_unverified_pairs_are_used_as_far_as_the_geometry_consent
         right = num_right(walk.world, pair, matches[pair])
         assert right > 0.95 * len(true)
         assert len(matches[pair]) - right < 0.1 * len(true), "a quarter was offered"
-    assert walk.model().image(UNVERIFIED + 1).num_points3D > MANY_OBSERVATIONS
+    assert walk.model().image(UNVERIFIED + 1).num_points3D > WELL_CONSTRAINED_OBSERVATIONS
 
 
-def test_weak_images_are_listed_and_keep_their_stitched_place_among_their_neighbours(walk: Refined) -> None:
-    (figures,) = walk.figures
-    assert figures.weak == (BLIND, WEAK)
-    assert figures.final.num_weak == 2
+def test_weak_images_are_listed_and_keep_their_initial_pose_relative_to_their_neighbours(walk: Refined) -> None:
+    (result,) = walk.results
+    assert result.weak == walk.names(BLIND, WEAK)
+    assert result.statistics.num_weak == 2
     poses = poses_of(walk.model())
-    for weak in figures.weak:
+    for weak in (BLIND, WEAK):
         near = min((i for i in SOUND if i != WITHOUT_POSE), key=lambda i: abs(i - weak))
         there, before = (rotation_and_centre_from(p[near], p[weak]) for p in (poses, dict(enumerate(walk.stitched))))
         np.testing.assert_allclose(there, before, atol=1e-9)
-    assert walk.model().image(WEAK + 1).num_points3D < ENOUGH_OBSERVATIONS
+    assert walk.model().image(WEAK + 1).num_points3D < MIN_OBSERVATIONS
 
 
 def rotation_and_centre_from(near_from_world: FloatArray, weak_from_world: FloatArray) -> FloatArray:
@@ -260,8 +262,8 @@ def rotation_and_centre_from(near_from_world: FloatArray, weak_from_world: Float
     return np.column_stack([rotation, near_from_world[:, 3] - rotation @ weak_from_world[:, 3]])
 
 
-def test_observations_that_a_weak_image_kept_fit_where_it_stands(walk: Refined) -> None:
-    """It was put back; what does not fit there any more must not stay in the tracks."""
+def test_observations_of_a_weak_image_fit_its_pose(walk: Refined) -> None:
+    """It was reset; observations that do not fit any more must not stay in the tracks."""
     model = walk.model()
     image = model.image(WEAK + 1)
     for point2d in image.points2D:
@@ -271,10 +273,10 @@ def test_observations_that_a_weak_image_kept_fit_where_it_stands(walk: Refined) 
             assert np.linalg.norm(point2d.xy - seen) <= 4.001
 
 
-def test_image_without_a_pose_is_placed(walk: Refined) -> None:
-    (figures,) = walk.figures
-    assert figures.registered == (WITHOUT_POSE,)
-    assert figures.final.num_images == NUM_IMAGES
+def test_image_without_a_pose_is_registered(walk: Refined) -> None:
+    (result,) = walk.results
+    assert result.registered == walk.names(WITHOUT_POSE)
+    assert result.statistics.num_images == NUM_IMAGES
     pose = poses_of(walk.model())[WITHOUT_POSE]
     assert angle_deg(pose, walk.world.cam_from_world[WITHOUT_POSE]) < 0.4
     off = np.linalg.norm(centres_of(pose[None])[0] - walk.world.centres[WITHOUT_POSE])
@@ -293,21 +295,21 @@ def test_tracks_are_of_two_images_or_more_and_of_the_right_points(walk: Refined)
     assert 0.9 * len(walk.world.points) < len(model.points3D) < 1.15 * len(walk.world.points)
 
 
-def test_points_of_two_images_are_left_out_where_both_have_enough_others(walk: Refined) -> None:
-    assert_no_needless_pairs(walk.model())
+def test_points_of_two_images_are_removed_if_both_have_enough_others(walk: Refined) -> None:
+    assert_no_redundant_points(walk.model())
 
 
-def test_points_that_the_last_filter_leaves_two_images_go_too(tmp_path: Path) -> None:
+def test_points_that_the_last_filter_leaves_to_two_images_are_removed_too(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     world = make_world(arc(14), ball(300, rng), rng, noise_px=1.4)
-    result = refined(
+    made = refined(
         tmp_path, world, disturbed(world.cam_from_world, rng, position=0.004 * world.extent, rotation_deg=0.3)
     )
-    assert result.figures[0].weak == ()
-    assert_no_needless_pairs(result.model())
+    assert made.results[0].weak == ()
+    assert_no_redundant_points(made.model())
 
 
-def assert_no_needless_pairs(model: pycolmap.Reconstruction) -> None:
+def assert_no_redundant_points(model: pycolmap.Reconstruction) -> None:
     longer = dict.fromkeys(model.images, 0)
     pairs = []
     for point in model.points3D.values():
@@ -317,11 +319,11 @@ def assert_no_needless_pairs(model: pycolmap.Reconstruction) -> None:
         else:
             for image_id in images:
                 longer[image_id] += 1
-    assert sum(count >= MANY_OBSERVATIONS for count in longer.values()) >= 10
-    assert all(min(longer[i] for i in pair) < MANY_OBSERVATIONS for pair in pairs)
+    assert sum(count >= WELL_CONSTRAINED_OBSERVATIONS for count in longer.values()) >= 10
+    assert all(min(longer[i] for i in pair) < WELL_CONSTRAINED_OBSERVATIONS for pair in pairs)
 
 
-def test_needless_points_go_and_the_others_stay() -> None:
+def test_redundant_points_are_those_of_two_images_with_enough_others() -> None:
     """Images 1 to 3 share 80 points; 1 and 2 share 10 more, and 3 and 4 share 7, all that 4 has."""
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(CAMERA.colmap_camera(1))
@@ -333,10 +335,8 @@ def test_needless_points_go_and_the_others_stay() -> None:
     for row, images in enumerate(seen_by):
         elements = [pycolmap.TrackElement(image_id, row) for image_id in images]
         model.add_point3D(np.array([0.0, 0, 1 + row]), pycolmap.Track(elements), np.zeros(3, np.uint8))
-    mapper = SimpleNamespace(observation_manager=pycolmap.ObservationManager(model))
-    Bench.drop_needless_pairs(cast(Bench, SimpleNamespace(model=model, mapper=mapper)))
-    tracks = [tuple(e.image_id for e in point.track.elements) for point in model.points3D.values()]
-    assert sorted(tracks) == [(1, 2, 3)] * 80 + [(3, 4)] * 7
+    tracks = [tuple(e.image_id for e in model.point3D(i).track.elements) for i in redundant_points(model)]
+    assert tracks == [(1, 2)] * 10
 
 
 def test_database_and_model_name_and_number_everything_alike(walk: Refined) -> None:
@@ -398,8 +398,8 @@ def test_cameras_of_other_models_are_found(
     rng = np.random.default_rng(7)
     world = make_world(arc(12), 2.2 * ball(250, rng), rng, camera=true_camera)  # into the corners
     stitched = disturbed(world.cam_from_world, rng, position=0.004 * world.extent, rotation_deg=0.3)
-    result = refined(tmp_path, world, stitched, camera=replace(true_camera, params=start))
-    camera = result.model().camera(1)
+    made = refined(tmp_path, world, stitched, camera=replace(true_camera, params=start))
+    camera = made.model().camera(1)
     assert camera.model.name == model
     where_points_are = np.array([(220.0, 170.0), (420.0, 170.0), (320.0, 330.0)])
     found, at_first, true_rays = (
@@ -407,24 +407,24 @@ def test_cameras_of_other_models_are_found(
         for one in (Intrinsics.from_colmap(camera), replace(true_camera, params=start), true_camera)
     )
     assert np.abs(found - true_rays).max() < np.abs(at_first - true_rays).max() / 2
-    _, aligned = fitted(centres_of(np.stack(list(poses_of(result.model()).values()))), world.centres)
+    _, aligned = fitted(centres_of(np.stack(list(poses_of(made.model()).values()))), world.centres)
     assert rms(aligned, world.centres) < rms(centres_of(stitched), world.centres) / 3
 
 
-def test_distortion_that_runs_away_is_held_and_everything_else_adjusted(tmp_path: Path) -> None:
+def test_distortion_that_diverges_is_fixed_and_everything_else_adjusted(tmp_path: Path) -> None:
     """Near the middle of a fisheye image its four terms make up for each other."""
     params = (350.0, 350.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0)
     camera = Intrinsics(model="OPENCV_FISHEYE", width=640, height=480, params=params)
     rng = np.random.default_rng(7)
     world = make_world(arc(12), ball(250, rng), rng, camera=camera)
     stitched = disturbed(world.cam_from_world, rng, position=0.004 * world.extent, rotation_deg=0.3)
-    result = refined(tmp_path, world, stitched, camera=camera)
-    steps = [(step.name, step.kept) for step in result.figures[0].steps]
-    k = steps.index(("adjustment", False))
-    assert "distortion of camera 1 went beyond" in result.figures[0].steps[k].reason
-    assert steps[k + 1] == ("adjustment with cameras held", True)
-    assert tuple(result.model().camera(1).params) == params
-    _, aligned = fitted(centres_of(np.stack(list(poses_of(result.model()).values()))), world.centres)
+    made = refined(tmp_path, world, stitched, camera=camera)
+    steps = [(step.name, step.accepted) for step in made.results[0].steps]
+    k = steps.index(("bundle adjustment", False))
+    assert "distortion parameter of camera 1 exceeds" in made.results[0].steps[k].reason
+    assert steps[k + 1] == ("bundle adjustment with fixed intrinsics", True)
+    assert tuple(made.model().camera(1).params) == params
+    _, aligned = fitted(centres_of(np.stack(list(poses_of(made.model()).values()))), world.centres)
     assert rms(aligned, world.centres) < rms(centres_of(stitched), world.centres) / 3
 
 
@@ -435,8 +435,8 @@ def test_scale_and_frame_stay_because_of_the_priors(tmp_path: Path, monkeypatch:
     world = make_world(arc(12), ball(150, rng), rng)
     stitched = disturbed_around_the_truth(world, rng)
     found = {}
-    for name, min_priors in (("with", adjustment.MIN_PRIORS), ("without", 1000)):
-        monkeypatch.setattr(adjustment, "MIN_PRIORS", min_priors)
+    for name, min_priors in (("with", bundle_adjustment.MIN_PRIORS), ("without", 1000)):
+        monkeypatch.setattr(bundle_adjustment, "MIN_PRIORS", min_priors)
         folder = tmp_path / name
         folder.mkdir()
         poses = poses_of(refined(folder, world, stitched).model())
@@ -461,8 +461,8 @@ def two_scenes(tmp_path_factory: pytest.TempPathFactory) -> Refined:
 
 
 def test_every_scene_is_refined_by_itself(two_scenes: Refined) -> None:
-    first, second, alone = two_scenes.figures
-    assert (first.kept, second.kept, alone.kept) == (True, True, False)
+    first, second, alone = two_scenes.results
+    assert (first.succeeded, second.succeeded, alone.succeeded) == (True, True, False)
     assert sorted(poses_of(two_scenes.model(0))) == [*range(7)]
     assert sorted(poses_of(two_scenes.model(1))) == [*range(7, 12)]
     for number, images, scale in ((0, range(7), 1.0), (1, range(7, 12), 2.5)):
@@ -474,10 +474,10 @@ def test_every_scene_is_refined_by_itself(two_scenes: Refined) -> None:
         assert rms(aligned, centres) / scale / two_scenes.world.extent < 2e-3
 
 
-def test_image_alone_is_kept_as_it_is_with_a_reason(two_scenes: Refined) -> None:
-    alone = two_scenes.figures[2]
+def test_single_image_keeps_its_pose_with_a_reason(two_scenes: Refined) -> None:
+    alone = two_scenes.results[2]
     assert "no point could be triangulated" in alone.reason
-    assert (alone.registered, alone.final.num_points) == ((), 0)
+    assert (alone.registered, alone.statistics.num_points) == ((), 0)
 
 
 def test_calibrated_cameras_stay_to_the_last_digit(two_scenes: Refined) -> None:
@@ -524,19 +524,19 @@ def only_turning(world: World) -> World:
 
 
 @pytest.mark.parametrize("make", [no_matches, no_features, first_image, only_turning])
-def test_where_nothing_can_be_triangulated_the_stitched_result_stays_with_a_reason(
+def test_if_nothing_can_be_triangulated_the_initial_poses_are_kept_with_a_reason(
     make: Callable[[World], World], tmp_path: Path
 ) -> None:
     world = make(small_world()[0])
-    result = refined(tmp_path, world, world.cam_from_world)
-    (figures,) = result.figures
-    assert not figures.kept
-    assert "no point could be triangulated" in figures.reason
-    assert figures.weak == tuple(range(len(world)))
-    poses = poses_of(result.model())
+    made = refined(tmp_path, world, world.cam_from_world)
+    (result,) = made.results
+    assert not result.succeeded
+    assert "no point could be triangulated" in result.reason
+    assert result.weak == made.names(*range(len(world)))
+    poses = poses_of(made.model())
     for i, pose in enumerate(world.cam_from_world):
         np.testing.assert_allclose(poses[i], pose, atol=1e-12)
-    with pycolmap.Database.open(result.folder / "database.db") as database:
+    with pycolmap.Database.open(made.folder / "database.db") as database:
         assert database.num_images() == len(world)
 
 
@@ -544,50 +544,52 @@ def test_two_images_are_refined(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     world = make_world(arc(12)[[0, 2]], ball(200, rng), rng)
     stitched = disturbed(world.cam_from_world, rng, position=0.01, rotation_deg=0.3)
-    result = refined(tmp_path, world, stitched)
-    (figures,) = result.figures
-    assert figures.kept
-    assert figures.final.num_points > 60
-    assert figures.final.mean_track_length == 2.0
-    assert figures.final.reprojection_error_px < 0.4
-    assert tuple(result.model().camera(1).params) == CAMERA.params
+    made = refined(tmp_path, world, stitched)
+    (result,) = made.results
+    assert result.succeeded
+    assert result.statistics.num_points > 60
+    assert result.statistics.mean_track_length == 2.0
+    assert result.statistics.reprojection_error_px < 0.4
+    assert tuple(made.model().camera(1).params) == CAMERA.params
 
 
-def test_where_no_image_sees_enough_the_stitched_result_stays(tmp_path: Path) -> None:
+def test_if_all_images_are_weak_the_initial_poses_are_kept(tmp_path: Path) -> None:
     rng = np.random.default_rng(6)
     world = make_world(arc(5, angle=0.2 * np.pi), ball(14, rng), rng, clutter=5)
     stitched = disturbed(world.cam_from_world, rng, position=0.01, rotation_deg=0.2)
-    result = refined(tmp_path, world, stitched)
-    (figures,) = result.figures
-    assert not figures.kept
-    assert figures.reason == "no image sees enough points to be adjusted by"
-    assert figures.weak == tuple(range(5))
+    made = refined(tmp_path, world, stitched)
+    (result,) = made.results
+    assert not result.succeeded
+    assert result.reason == "no image has enough observations"
+    assert result.weak == made.names(*range(5))
 
 
-def test_image_that_was_placed_on_too_little_is_given_up_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_image_that_was_registered_and_ends_up_weak_is_deregistered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rng = np.random.default_rng(8)
     world = make_world(arc(8, angle=0.35 * np.pi), ball(160, rng), rng)
     few = world.point_of[7].copy()
     few[np.flatnonzero(few >= 0)[45:]] = -1
     world = replace(world, point_of=(*world.point_of[:7], few))
-    for enough, found in ((ENOUGH_OBSERVATIONS, (7,)), (60, ())):
-        monkeypatch.setattr(adjustment, "ENOUGH_OBSERVATIONS", enough)
+    for enough, found in ((MIN_OBSERVATIONS, (7,)), (60, ())):
+        monkeypatch.setattr(statistics, "MIN_OBSERVATIONS", enough)
         folder = tmp_path / str(enough)
         folder.mkdir()
-        result = refined(folder, world, world.cam_from_world, scenes=[range(7)])
-        (figures,) = result.figures
-        assert figures.registered == found
-        assert figures.weak == ()
-        assert figures.final.num_images == 7 + len(found)
-        model = result.model()
+        made = refined(folder, world, world.cam_from_world, scenes=[range(7)])
+        (result,) = made.results
+        assert result.registered == made.names(*found)
+        assert result.weak == ()
+        assert result.statistics.num_images == 7 + len(found)
+        model = made.model()
         assert sorted(model.images) == list(range(1, 8 + len(found)))
         assert all(e.image_id in model.images for point in model.points3D.values() for e in point.track.elements)
         assert all(point.track.length() >= 2 for point in model.points3D.values())
 
 
-# ------------------------------------------------------------------------- undone
+# ----------------------------------------------------------------------- rejected
 @pytest.mark.slow
-def test_adjustments_that_diverge_are_undone_and_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_adjustments_that_diverge_are_rejected_and_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def diverge(model: pycolmap.Reconstruction, *_: Any, **__: Any) -> bool:
         rng = np.random.default_rng(0)
         for frame_id in model.reg_frame_ids():
@@ -598,32 +600,36 @@ def test_adjustments_that_diverge_are_undone_and_reported(tmp_path: Path, monkey
         return True
 
     world, stitched = small_world()
-    monkeypatch.setattr(task, "adjust", diverge)
-    result = refined(tmp_path, world, stitched)
-    (figures,) = result.figures
-    undone = [step for step in figures.steps if "adjustment" in step.name]
-    assert len(undone) >= 6
-    assert [step.name for step in undone[:2]] == ["adjustment", "adjustment with cameras held"]
-    assert not any(step.kept for step in undone)
-    assert all("focal length of camera 1 went to 3 times" in step.reason for step in undone)
-    assert f"no adjustment stood: {undone[-1].reason}" in figures.warnings
-    assert tuple(result.model().camera(1).params) == CAMERA.params
-    poses = poses_of(result.model())
+    monkeypatch.setattr(mapper, "adjust", diverge)
+    made = refined(tmp_path, world, stitched)
+    (result,) = made.results
+    rejected = [step for step in result.steps if "adjustment" in step.name]
+    assert len(rejected) >= 6
+    assert [step.name for step in rejected[:2]] == ["bundle adjustment", "bundle adjustment with fixed intrinsics"]
+    assert not any(step.accepted for step in rejected)
+    assert all("focal length of camera 1 changed by a factor of 3" in step.reason for step in rejected)
+    assert f"no bundle adjustment was accepted: {rejected[-1].reason}" in result.warnings
+    assert tuple(made.model().camera(1).params) == CAMERA.params
+    poses = poses_of(made.model())
     for i, pose in enumerate(stitched):
         np.testing.assert_allclose(poses[i], pose, atol=1e-14)
 
 
-def test_large_model_goes_through_the_adjustment_of_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_segments_of_a_large_model_are_adjusted_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     world, stitched = small_world(num_images=10)
-    monkeypatch.setattr(task, "LARGE", 9)
-    result = refined(tmp_path, world, stitched, parts=((0, 1, 2, 3, 4, 5), (4, 5, 6, 7, 8, 9), (100, 101)))
-    (figures,) = result.figures
-    assert [step.name for step in figures.steps][:3] == ["triangulation", "adjustment of parts", "adjustment"]
-    parts, whole = figures.steps[1:3]
-    assert parts.kept
-    assert parts.before.reprojection_error_px > 1.5 * parts.after.reprojection_error_px
-    assert 0 < whole.after.reprojection_error_px < parts.after.reprojection_error_px
-    poses = poses_of(result.model())
+    monkeypatch.setattr(mapper, "LARGE_SCENE_IMAGES", 9)
+    made = refined(tmp_path, world, stitched, segments=((0, 1, 2, 3, 4, 5), (4, 5, 6, 7, 8, 9), (100, 101)))
+    (result,) = made.results
+    assert [step.name for step in result.steps][:3] == [
+        "triangulation",
+        "bundle adjustment of segments",
+        "bundle adjustment",
+    ]
+    segments, whole = result.steps[1:3]
+    assert segments.accepted
+    assert segments.before.reprojection_error_px > 1.5 * segments.after.reprojection_error_px
+    assert 0 < whole.after.reprojection_error_px < segments.after.reprojection_error_px
+    poses = poses_of(made.model())
     centres = centres_of(np.stack([poses[i] for i in range(10)]))
     _, aligned = fitted(centres, world.centres)
     assert rms(aligned, world.centres) / world.extent < 2e-3
@@ -635,9 +641,9 @@ def test_one_thread_gives_the_same_bits_twice(tmp_path: Path) -> None:
     files: list[dict[str, bytes]] = []
     for name in ("first", "second"):
         (tmp_path / name).mkdir()
-        result = refined(tmp_path / name, world, stitched, scenes=[range(6)])
-        assert result.figures[0].registered == (6,)
-        files.append({path.name: path.read_bytes() for path in sorted((result.folder / "0" / "model").iterdir())})
+        made = refined(tmp_path / name, world, stitched, scenes=[range(6)])
+        assert made.results[0].registered == made.names(6)
+        files.append({path.name: path.read_bytes() for path in sorted((made.folder / "0" / "model").iterdir())})
     assert {"images.bin", "points3D.bin", "cameras.bin"} <= files[0].keys()
     assert files[0] == files[1]
 
@@ -688,7 +694,7 @@ def test_child_does_the_work_and_a_second_start_reads_what_it_stored(
     first = start.refine()
     assert first.models == (first.folder / "0" / "model",)
     assert first.database.is_file()
-    assert first.figures[0].kept
+    assert first.results[0].succeeded
     (scene,) = first.scenes
     poses = poses_of(pycolmap.Reconstruction(first.folder / "0" / "model"))
     np.testing.assert_array_equal(scene.cam_from_world, np.stack([poses[i] for i in range(len(scene))]))
@@ -701,7 +707,7 @@ def test_child_does_the_work_and_a_second_start_reads_what_it_stored(
 
     monkeypatch.setattr(refine, "in_child", refuse)
     second = start.refine()
-    assert second.figures == first.figures
+    assert second.results == first.results
     np.testing.assert_array_equal(second.scenes[0].cam_from_world, scene.cam_from_world)
     assert second.scenes[0].cameras == scene.cameras
 
@@ -745,19 +751,19 @@ def test_second_start_wants_the_same_pairs_although_they_are_matched_now(
     second = start.refine(options, with_surfaces=True)
     assert wanted[0] == wanted[1] != []
     assert not set(wanted[0]) & set(pairs_within(range(len(start.world)), 3))
-    assert first.figures == second.figures
+    assert first.results == second.results
     assert first.folder.joinpath("stage.json").read_bytes() == second.folder.joinpath("stage.json").read_bytes()
 
 
-def assert_stitched(result: Refinement, start: Start) -> None:
-    assert result.scenes == start.scenes
-    assert result.models == (None,)
-    (figures,) = result.figures
-    assert not figures.kept
-    assert figures.steps == ()
+def assert_not_refined(made: Refinement, start: Start) -> None:
+    assert made.scenes == start.scenes
+    assert made.models == (None,)
+    (result,) = made.results
+    assert not result.succeeded
+    assert result.steps == ()
 
 
-def test_child_that_is_killed_leaves_the_stitched_scenes_with_a_reason(start: Start) -> None:
+def test_child_that_is_killed_leaves_the_initial_poses_with_a_reason(start: Start) -> None:
     over = threading.Event()
 
     def kill() -> None:
@@ -768,22 +774,22 @@ def test_child_that_is_killed_leaves_the_stitched_scenes_with_a_reason(start: St
     killer = threading.Thread(target=kill)
     killer.start()
     try:
-        result = start.refine()
+        made = start.refine()
     finally:
         over.set()
         killer.join()
-    assert_stitched(result, start)
-    assert "the process that worked on it died" in result.figures[0].reason
+    assert_not_refined(made, start)
+    assert "the process that worked on it died" in made.results[0].reason
     assert not list((start.output / "work").glob("refined*/stage.json"))
 
 
 @pytest.mark.slow
-def test_database_that_breaks_leaves_the_stitched_scenes_with_a_reason(start: Start) -> None:
+def test_damaged_database_leaves_the_initial_poses_with_a_reason(start: Start) -> None:
     with sqlite3.connect(start.features.database) as connection:
         connection.execute("UPDATE keypoints SET rows = 5")
-    result = start.refine()
-    assert_stitched(result, start)
-    assert result.figures[0].reason
+    made = start.refine()
+    assert_not_refined(made, start)
+    assert made.results[0].reason
 
 
 def test_tracks_of_pointmaps_need_maps(start: Start) -> None:
@@ -812,5 +818,5 @@ def test_surface_of_an_image_is_the_nearest_of_the_cloud_in_every_cell() -> None
     assert set(surfaces) == set(range(len(world)))
     for i, points in surfaces.items():
         towards = world.centres[i] / np.linalg.norm(world.centres[i])
-        assert 15 < len(points) <= GRID**2
+        assert 15 < len(points) <= GRID_CELLS**2
         assert (points @ towards > 0).mean() > 0.9, "the far side of the ball is hidden"

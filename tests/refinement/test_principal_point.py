@@ -1,4 +1,4 @@
-"""The principal point leaves the middle of the image where the pixels say so, and only there."""
+"""The principal point is refined where the model determines it, and only there."""
 
 from __future__ import annotations
 
@@ -42,16 +42,17 @@ from smust3r_colmap.refinement import global_refinement as task
 from smust3r_colmap.refinement import principal_point
 from smust3r_colmap.refinement import stage as refine
 from smust3r_colmap.refinement.bundle_adjustment import Priors, adjust, priors_of
-from smust3r_colmap.refinement.global_refinement import RefinedFigures, RefineTask, refine_scenes
+from smust3r_colmap.refinement.global_refinement import RefineTask, refine_scenes
 from smust3r_colmap.refinement.principal_point import (
-    AGREEMENT,
-    MAX_SHIFT,
-    MIN_GAIN,
+    MAX_DIFFERENCE_FRACTION,
+    MAX_SHIFT_FRACTION,
+    MIN_COST_REDUCTION,
     MIN_IMAGES,
-    PrincipalPointAnswer,
-    ask_for_principal_points,
+    PrincipalPointEstimate,
+    estimate_principal_points,
 )
 from smust3r_colmap.refinement.stage import InitialScenes
+from smust3r_colmap.refinement.statistics import SceneRefinement
 from smust3r_colmap.storage.run_directory import StageFolder
 
 pytestmark = pytest.mark.usefixtures("quiet_pycolmap")
@@ -60,7 +61,7 @@ MIDDLE = np.array([320.0, 240.0])
 SHIFT = np.array([5.12, -3.84])
 """One percent of the width: 6.4 px."""
 NUM_IMAGES = 20
-NO_GAIN = r"another place would save only 0\.0\d % of the cost"
+NO_GAIN = r"another principal point saves only 0\.0\d % of the cost"
 
 
 def off_centre(shift: FloatArray, *, distortion: float = CAMERA.params[3]) -> Intrinsics:
@@ -92,15 +93,15 @@ def corridor(num_points: int, rng: np.random.Generator) -> FloatArray:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Asked:
+class Adjusted:
     """A model that was adjusted with the principal point in the middle, and where it came from."""
 
     world: World
     priors: Priors
     model: pycolmap.Reconstruction
 
-    def ask(self) -> PrincipalPointAnswer:
-        return ask_for_principal_points(self.model, self.priors, threads=1)
+    def estimate(self) -> PrincipalPointEstimate:
+        return estimate_principal_points(self.model, self.priors, threads=1)
 
     def errors(self, model: pycolmap.Reconstruction) -> tuple[float, float]:
         """Rms of the centres, as a part of the extent, and mean of the angles in degrees, of a model's cameras."""
@@ -110,23 +111,25 @@ class Asked:
         return rms(aligned, self.world.centres) / self.world.extent, float(np.mean(angles))
 
 
-def adjusted(world: World, rng: np.random.Generator, *, distortion: float = CAMERA.params[3]) -> Asked:
+def adjusted(world: World, rng: np.random.Generator, *, distortion: float = CAMERA.params[3]) -> Adjusted:
     """From stitched poses, true tracks, and the principal point in the middle."""
     stitched = disturbed(world.cam_from_world, rng, position=0.005 * world.extent, rotation_deg=0.3)
     camera = off_centre(np.zeros(2), distortion=distortion)
     model = model_with_true_tracks(world, stitched, rng, camera=camera, noise=1e-3)
     priors = priors_of(model)
     assert adjust(model, priors, calibrated=False, max_iterations=30, threads=1)
-    return Asked(world=world, priors=priors, model=model)
+    return Adjusted(world=world, priors=priors, model=model)
 
 
-def from_many_sides(shift: FloatArray, *, seed: int = 1, num_images: int = NUM_IMAGES, num_points: int = 300) -> Asked:
+def from_many_sides(
+    shift: FloatArray, *, seed: int = 1, num_images: int = NUM_IMAGES, num_points: int = 300
+) -> Adjusted:
     rng = np.random.default_rng(seed)
     return adjusted(make_world(around(num_images), 2 * ball(num_points, rng), rng, camera=off_centre(shift)), rng)
 
 
 @pytest.fixture(scope="module")
-def courtyard() -> Asked:
+def courtyard() -> Adjusted:
     """Off centre by 1 % of the width."""
     return from_many_sides(SHIFT)
 
@@ -145,8 +148,8 @@ def everything(model: pycolmap.Reconstruction) -> dict[str, bytes | int]:
 
 
 # --------------------------------------------------------------------------- the answer
-def test_one_percent_off_is_found_and_the_poses_get_better(courtyard: Asked) -> None:
-    answer = courtyard.ask()
+def test_one_percent_off_is_found_and_the_poses_get_better(courtyard: Adjusted) -> None:
+    answer = courtyard.estimate()
     assert answer.reason == ""
     assert set(answer.xy_img) == {1}
     assert 0.01 < np.linalg.norm(answer.xy_img[1] - MIDDLE - SHIFT) < 0.6
@@ -161,21 +164,21 @@ def test_one_percent_off_is_found_and_the_poses_get_better(courtyard: Asked) -> 
     assert 0.3 < turned_before < 0.6
 
 
-def test_model_that_was_asked_stays_as_it_is(courtyard: Asked) -> None:
+def test_model_is_not_changed(courtyard: Adjusted) -> None:
     before = everything(courtyard.model)
     assert len(before) > 600
-    assert courtyard.ask().xy_img
+    assert courtyard.estimate().xy_img
     assert everything(courtyard.model) == before
 
 
-def test_one_thread_answers_the_same_twice(courtyard: Asked) -> None:
-    np.testing.assert_array_equal(courtyard.ask().xy_img[1], courtyard.ask().xy_img[1])
+def test_one_thread_gives_the_same_estimate_twice(courtyard: Adjusted) -> None:
+    np.testing.assert_array_equal(courtyard.estimate().xy_img[1], courtyard.estimate().xy_img[1])
 
 
 @pytest.mark.parametrize("seed", [2, 3, 4])
-def test_middle_stays_the_middle(seed: int) -> None:
+def test_image_centre_stays_where_it_is_right(seed: int) -> None:
     """Noise saves next to nothing by moving it."""
-    answer = from_many_sides(np.zeros(2), seed=seed, num_points=500).ask()
+    answer = from_many_sides(np.zeros(2), seed=seed, num_points=500).estimate()
     assert np.linalg.norm(answer.xy_img[1] - MIDDLE) < 2e-3 * CAMERA.width
     left_at = MIDDLE if answer.reason else answer.xy_img[1]
     assert np.linalg.norm(left_at - MIDDLE) < 1e-3 * CAMERA.width
@@ -188,19 +191,19 @@ def test_straight_drive_is_refused_because_nothing_is_saved(shift: FloatArray) -
     rng = np.random.default_rng(1)
     camera = off_centre(shift, distortion=0.0)
     drive = adjusted(make_world(forward(NUM_IMAGES), corridor(300, rng), rng, camera=camera), rng, distortion=0.0)
-    answer = drive.ask()
+    answer = drive.estimate()
     assert pytest.approx(MIDDLE, abs=1) == answer.xy_img[1]
     assert re.fullmatch(NO_GAIN, answer.reason), answer.reason
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_errors_of_the_priors_are_no_agreement(seed: int) -> None:
+def test_errors_of_the_priors_do_not_count_as_agreement(seed: int) -> None:
     """Cameras that sway and never turn leave a shear of the world open, which priors close by their own errors."""
     rng = np.random.default_rng(seed)
     poses = forward(NUM_IMAGES, sway=rng.normal(scale=0.3, size=(NUM_IMAGES, 2)))
     camera = off_centre(np.zeros(2), distortion=0.0)
     drive = adjusted(make_world(poses, corridor(300, rng), rng, camera=camera), rng, distortion=0.0)
-    answer = drive.ask()
+    answer = drive.estimate()
     assert re.fullmatch(NO_GAIN, answer.reason), answer.reason
 
 
@@ -211,7 +214,9 @@ def decentred(keypoints: npt.NDArray[np.floating], p1: float) -> FloatArray:
 
 
 @pytest.mark.parametrize("seed", [2, 4, 6])
-def test_what_the_camera_model_lacks_is_no_principal_point(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_camera_model_lacks_does_not_move_the_principal_point(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Cameras that turn little on their way: both halves agree on a shift that makes up for a tilted lens."""
     rng = np.random.default_rng(seed)
     centres = np.column_stack([rng.normal(scale=0.3, size=(NUM_IMAGES, 2)), 0.25 * np.arange(NUM_IMAGES)])
@@ -220,23 +225,23 @@ def test_what_the_camera_model_lacks_is_no_principal_point(seed: int, monkeypatc
     world = make_world(cam_from_world_towards(centres, centres + ahead), corridor(500, rng), rng, camera=camera)
     tilted = tuple(decentred(keypoints, 1e-3).astype(np.float32) for keypoints in world.keypoints)
     street = adjusted(replace(world, keypoints=tilted), rng, distortion=0.0)
-    answer = street.ask()
-    assert re.fullmatch(r"another place would save only 0\.[0-5]\d % of the cost", answer.reason), answer.reason
+    answer = street.estimate()
+    assert re.fullmatch(r"another principal point saves only 0\.[0-5]\d % of the cost", answer.reason), answer.reason
 
-    monkeypatch.setattr(principal_point, "MIN_GAIN", -1.0)
-    fallen_for = street.ask()
+    monkeypatch.setattr(principal_point, "MIN_COST_REDUCTION", -1.0)
+    fallen_for = street.estimate()
     assert np.linalg.norm(fallen_for.xy_img[1] - MIDDLE) > 0.8
     assert fallen_for.reason == ""
 
 
 @pytest.mark.parametrize("num_images", [MIN_IMAGES - 1, MIN_IMAGES])
-def test_fewer_than_eight_images_are_not_asked(num_images: int) -> None:
-    answer = from_many_sides(SHIFT, num_images=num_images).ask()
+def test_fewer_than_eight_images_give_no_estimate(num_images: int) -> None:
+    answer = from_many_sides(SHIFT, num_images=num_images).estimate()
     assert (answer.reason == f"camera 1 has {num_images} of 8 images") == (num_images < MIN_IMAGES)
     assert (not answer.xy_img) == (num_images < MIN_IMAGES)
 
 
-def test_eight_images_are_needed_of_every_camera(courtyard: Asked) -> None:
+def test_eight_images_are_needed_of_every_camera(courtyard: Adjusted) -> None:
     model = pycolmap.Reconstruction(courtyard.model)
     second = off_centre(np.zeros(2)).colmap_camera(2)
     model.add_camera_with_trivial_rig(second)
@@ -244,7 +249,7 @@ def test_eight_images_are_needed_of_every_camera(courtyard: Asked) -> None:
         twin = model.image(image_id - NUM_IMAGES)
         image = pycolmap.Image(name=f"{image_id}.png", keypoints=np.zeros((0, 2)), camera_id=2, image_id=image_id)
         model.add_image_with_trivial_frame(image, twin.cam_from_world())
-    answer = ask_for_principal_points(model, courtyard.priors, threads=1)
+    answer = estimate_principal_points(model, courtyard.priors, threads=1)
     assert answer.reason == "camera 2 has 7 of 8 images"
     assert answer.xy_img == {}
 
@@ -252,31 +257,31 @@ def test_eight_images_are_needed_of_every_camera(courtyard: Asked) -> None:
 @pytest.mark.parametrize(("part", "accepted"), [(0.023, True), (0.027, False)])
 def test_shift_beyond_two_and_a_half_percent_is_refused(part: float, accepted: bool) -> None:
     shift = part * CAMERA.width * SHIFT / np.linalg.norm(SHIFT)
-    answer = from_many_sides(shift).ask()
+    answer = from_many_sides(shift).estimate()
     found = float(np.linalg.norm(answer.xy_img[1] - MIDDLE))
     assert part - 0.001 < found / CAMERA.width < part + 0.001
-    assert (found < MAX_SHIFT * CAMERA.width) == accepted
+    assert (found < MAX_SHIFT_FRACTION * CAMERA.width) == accepted
     assert answer.reason == ("" if accepted else f"the principal point of camera 1 would move by {found:.1f} px")
 
 
-def test_half_without_points_has_no_answer(courtyard: Asked) -> None:
+def test_half_without_points_gives_no_estimate(courtyard: Adjusted) -> None:
     model = pycolmap.Reconstruction(courtyard.model)
     for point_id in sorted(model.point3D_ids()):
         model.delete_point3D(point_id)
-    answer = ask_for_principal_points(model, courtyard.priors, threads=1)
-    assert (answer.reason, answer.xy_img) == ("half of the points gave no solution", {})
+    answer = estimate_principal_points(model, courtyard.priors, threads=1)
+    assert (answer.reason, answer.xy_img) == ("no usable solution for half of the points", {})
 
 
-def test_single_point_says_nothing(courtyard: Asked) -> None:
+def test_single_point_gives_no_estimate(courtyard: Adjusted) -> None:
     model = pycolmap.Reconstruction(courtyard.model)
     for point_id in sorted(model.point3D_ids())[1:]:
         model.delete_point3D(point_id)
-    assert ask_for_principal_points(model, courtyard.priors, threads=1).reason
+    assert estimate_principal_points(model, courtyard.priors, threads=1).reason
 
 
-def test_halves_share_no_point_and_every_image_has_enough(courtyard: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_halves_share_no_point_and_every_image_has_enough(courtyard: Adjusted, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of ever so many observations, the long tracks are taken until each image has its share."""
-    monkeypatch.setattr(principal_point, "OBSERVATIONS", 0)
+    monkeypatch.setattr(principal_point, "TARGET_OBSERVATIONS", 0)
     monkeypatch.setattr(principal_point, "MIN_OBSERVATIONS_PER_IMAGE", 40)
     halves = []
 
@@ -286,8 +291,8 @@ def test_halves_share_no_point_and_every_image_has_enough(courtyard: Asked, monk
         return True
 
     monkeypatch.setattr(principal_point, "adjust", keep)
-    monkeypatch.setattr(principal_point, "MIN_GAIN", 0.0)
-    courtyard.ask()
+    monkeypatch.setattr(principal_point, "MIN_COST_REDUCTION", 0.0)
+    courtyard.estimate()
     first, second = (half.point3D_ids() for half in halves)
     assert not first & second
     assert 0.2 < len(first | second) / courtyard.model.num_points3D() < 0.8
@@ -299,9 +304,9 @@ def test_halves_share_no_point_and_every_image_has_enough(courtyard: Asked, monk
 
 @pytest.mark.parametrize(("first", "second", "accepted"), [(5.0, 8.0, True), (5.0, 8.6, False), (5.0, np.nan, False)])
 def test_halves_may_differ_by_half_of_the_shift(
-    courtyard: Asked, monkeypatch: pytest.MonkeyPatch, first: float, second: float, accepted: bool
+    courtyard: Adjusted, monkeypatch: pytest.MonkeyPatch, first: float, second: float, accepted: bool
 ) -> None:
-    assert AGREEMENT == 0.5
+    assert MAX_DIFFERENCE_FRACTION == 0.5
     answers, costs = iter([first, second]), iter([100.0, 98.0, 100.0, 98.0])
 
     def move(part: pycolmap.Reconstruction, *_: Any, principal_point: bool, **__: Any) -> bool:
@@ -312,7 +317,7 @@ def test_halves_may_differ_by_half_of_the_shift(
 
     monkeypatch.setattr(principal_point, "adjust", move)
     monkeypatch.setattr(principal_point, "robust_cost", lambda _: next(costs))
-    answer = courtyard.ask()
+    answer = courtyard.estimate()
     assert (answer.reason == "") == accepted
     if np.isfinite(second):
         np.testing.assert_allclose(answer.xy_img[1] - MIDDLE, [(first + second) / 2, 0], atol=1e-9)
@@ -320,12 +325,12 @@ def test_halves_may_differ_by_half_of_the_shift(
 
 @pytest.mark.parametrize(("second", "accepted"), [(99.3, True), (99.5, False), (np.nan, False)])
 def test_each_half_must_save_something(
-    courtyard: Asked, monkeypatch: pytest.MonkeyPatch, second: float, accepted: bool
+    courtyard: Adjusted, monkeypatch: pytest.MonkeyPatch, second: float, accepted: bool
 ) -> None:
-    assert 0.005 < MIN_GAIN < 0.007
+    assert 0.005 < MIN_COST_REDUCTION < 0.007
     costs = iter([100.0, 98.0, 100.0, second])
     monkeypatch.setattr(principal_point, "robust_cost", lambda _: next(costs))
-    assert (courtyard.ask().reason == "") == accepted
+    assert (courtyard.estimate().reason == "") == accepted
 
 
 # ----------------------------------------------------------------------- in refinement
@@ -349,39 +354,39 @@ def refine_task(folder: Path, seen: tuple[World, FloatArray], *, calibrated: boo
         features=folder / "features.db",
         maps=None,
         map_pairs=(),
-        parts=(),
+        segments=(),
         calibrated=calibrated,
         threads=1,
     )
 
 
-def refined(one: RefineTask) -> tuple[RefinedFigures, FloatArray]:
-    """The figures, and the parameters of the camera."""
-    (figures,) = refine_scenes(one)
-    assert figures.kept
-    return figures, np.array(pycolmap.Reconstruction(one.stored.path / "0" / "model").camera(1).params)
+def refined(one: RefineTask) -> tuple[SceneRefinement, FloatArray]:
+    """The result, and the parameters of the camera."""
+    (result,) = refine_scenes(one)
+    assert result.succeeded
+    return result, np.array(pycolmap.Reconstruction(one.stored.path / "0" / "model").camera(1).params)
 
 
 def test_refinement_finds_it(tmp_path: Path, seen: tuple[World, FloatArray]) -> None:
-    figures, params = refined(refine_task(tmp_path, seen))
-    assert "principal point" in [step.name for step in figures.steps], figures.principal_point
+    result, params = refined(refine_task(tmp_path, seen))
+    assert "principal point" in [step.name for step in result.steps], result.principal_point
     assert 0.01 < np.linalg.norm(params[1:3] - MIDDLE - SHIFT) < 1.2
 
 
 def test_refinement_leaves_it_in_the_middle_where_it_is_told_to(tmp_path: Path, seen: tuple[World, FloatArray]) -> None:
-    figures, params = refined(replace(refine_task(tmp_path, seen), principal_point=False))
-    assert "principal point" not in [step.name for step in figures.steps]
+    result, params = refined(replace(refine_task(tmp_path, seen), principal_point=False))
+    assert "principal point" not in [step.name for step in result.steps]
     assert params[1:3].tolist() == MIDDLE.tolist()
     assert params[0] != CAMERA.params[0]
 
 
-def test_calibrated_cameras_are_never_asked(
+def test_principal_points_of_calibrated_cameras_are_not_estimated(
     tmp_path: Path, seen: tuple[World, FloatArray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: Any, **__: Any) -> None:
-        raise AssertionError("somebody has measured it")
+        raise AssertionError("the intrinsics are given")
 
-    monkeypatch.setattr(task, "ask_for_principal_points", refuse)
+    monkeypatch.setattr(task, "estimate_principal_points", refuse)
     _, params = refined(refine_task(tmp_path, seen, calibrated=True))
     assert tuple(params) == CAMERA.params
 
@@ -406,4 +411,4 @@ def test_setting_of_the_run_reaches_the_task(
         options = RefinementConfig(principal_point=wanted)
         refine.refine(run, initial, one.collection, features, options, FeatureConfig())
     assert [each.principal_point for each in handed] == [wanted]
-    assert RefinementConfig().principal_point, "the middle is left by default"
+    assert RefinementConfig().principal_point, "refined by default"
