@@ -153,10 +153,10 @@ def test_tracks_are_real_and_the_summary_counts_them(result: RunSummary) -> None
     (refined,) = json.loads((result.output / "summary.json").read_text())["refinements"]
     assert refined["statistics"]["num_points"] == model.num_points3D() > 100
     assert refined["steps"][0]["name"] == "triangulation"
-    assert "principal point kept" in result.render_text() or "principal point free" in result.render_text()
+    assert "principal point fixed: " in result.render_text() or "principal point refined: " in result.render_text()
     assert refined["principal_point"] in result.render_text()
     adjustments = [step for step in refined["steps"] if "adjustment" in step["name"]]
-    assert adjustments[0]["error_after_px"] < adjustments[0]["error_before_px"]
+    assert adjustments[0]["after"]["reprojection_error_px"] < adjustments[0]["before"]["reprojection_error_px"]
 
 
 def test_the_model_and_the_database_go_together(result: RunSummary) -> None:
