@@ -34,7 +34,7 @@ where confidences start at 1."""
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Side:
-    """What one submodel says about some pixels.
+    """Some pixels of one submodel.
 
     Args:
         points_seg: (N, 3) float64. depth: (N,) float64. confidence: (N,) float64.

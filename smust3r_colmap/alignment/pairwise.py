@@ -377,7 +377,7 @@ def disagreement_sigmas(first: SegmentAlignment, second: SegmentAlignment) -> fl
     if not between.log_exists():
         return float("inf")
     difference = between.log()
-    # The inverse of the sum of both covariances, also where one of them says nothing about a direction.
+    # The inverse of the sum of both covariances, also where one of them does not measure a direction.
     both = first.information @ np.linalg.pinv(first.information + second.information) @ second.information
     return float(np.sqrt(difference @ both @ difference / len(difference)))
 

@@ -230,7 +230,7 @@ def implausibility(b_from_a: Transform, points_a: FloatArray) -> str:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SubmodelFit:
-    """``target_from_source`` between two submodels, with what tells a sound fit from a broken one.
+    """``target_from_source`` between two submodels, with the figures by which it is accepted or rejected.
 
     Args:
         estimate: the transform and the evidence of the solver.

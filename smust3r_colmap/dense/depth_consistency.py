@@ -35,7 +35,7 @@ FloatMap = npt.NDArray[np.float32]
 AnyFloats = npt.NDArray[np.floating[Any]]
 
 MIN_SCALE_POINTS = 12
-"""Sparse points on an image's map from which on it has a scale of its own; the median of fewer is luck."""
+"""Sparse points on an image's map from which on it has a scale of its own; the median of fewer is too uncertain."""
 MAX_SCALE_RATIO = 1.5
 """An image whose factor differs from the model's by more is rejected: the adjustment moves cameras by percents."""
 CHECK_NEIGHBOURS = 8
@@ -221,7 +221,7 @@ def _one_surface(depth: FloatMap) -> npt.NDArray[np.bool_]:
 
 
 def _evident_depth(maps: DepthMaps, name: str) -> FloatMap:
-    """(H, W) depth where there is any confidence, 0 elsewhere: with a confidence of 1 nothing speaks for it."""
+    """(H, W) depth where there is any confidence, 0 elsewhere: a confidence of 1 is none."""
     depth, confidence = maps.depth(name), maps.confidence(name)
     evident: FloatMap = np.where(np.isfinite(depth) & (depth > 0) & (confidence > 1), depth, 0).astype(np.float32)
     return evident
@@ -384,7 +384,7 @@ class _View:
 def _confirmed(depth: FloatMap, view: _View, others: Sequence[tuple[_View, _DepthLookup]]) -> FloatMap:
     """The depth that enough of the other views confirm, 0 elsewhere; pixels are left alone once they have enough.
 
-    Without another view there is nobody to ask, and all stays. In single precision, which is exact to a thousandth of
+    Without another view all depth stays. In single precision, which is exact to a thousandth of
     a pixel.
     """
     if not others:

@@ -1,4 +1,4 @@
-"""Confidence corrected by a second opinion: the same image seen in two segments (paper eq. 1).
+"""Confidence corrected by comparison: the same image reconstructed in two segments (paper eq. 1).
 
 Two neighbouring segments reconstruct their common images independently; where their depths differ,
 at least one is wrong, and neither should be trusted. The module ``alignment.from_pointmaps`` uses
@@ -45,8 +45,8 @@ def reweighted(
     Args:
         confidence_i, confidence_j: of one shape, at least 1.
         depth_i, depth_j: of the same shape, each in the unit of its own segment; zero, negative or
-            non-finite means none. A pixel without depth on either side has no second opinion: its
-            confidences stay as they are, and it has no say in the common scale.
+            non-finite means none. A pixel without depth on either side keeps its
+            confidences and takes no part in the common scale.
 
     Returns:
         Both new confidences, float64, of the same shape.

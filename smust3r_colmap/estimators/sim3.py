@@ -60,9 +60,9 @@ def estimate_sim3(
 ) -> TransformEstimate:
     """Robust ``b_from_a`` between matched points, by IRLS.
 
-    ``cauchy`` and ``tukey`` redescend (a wrong pair loses its pull entirely) with a scale from the
-    median residual, taken anew in every iteration; ``tukey`` starts where ``cauchy`` ends, since it
-    is blind beyond its cut. ``huber`` is the paper's and VGGT-Long's: ``huber_delta`` in units of b
+    ``cauchy`` and ``tukey`` redescend (an outlier loses its weight) with a scale from the
+    median residual, taken anew in every iteration; ``tukey`` starts where ``cauchy`` ends, since its
+    weight is zero beyond its cut. ``huber`` is the paper's and VGGT-Long's: ``huber_delta`` in units of b
     and 5 iterations.
 
     All kernels take VGGT-Long's scale of the transform, the ratio of the weighted RMS radii. It is

@@ -32,7 +32,7 @@ from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import TransformEstimate
 
 MAX_PAIRS = 10_000
-"""Rows that take part, however many are offered; with more, the model is wrong before the noise tells."""
+"""Rows that take part, however many are offered; with more, the error of the model exceeds that of the noise."""
 SAMPLE_SIZE = 5
 """Points that determine a projective transform of space: three equations each, fifteen unknowns."""
 DRAWS_PER_ROUND = 200
@@ -81,7 +81,7 @@ def estimate_sl4(
 
     The determinant is positive by construction: a sample passes only if each of its five tetrahedra
     keeps its orientation, which makes the determinant of its transform positive and puts all five in
-    front of the plane at infinity; a fit to more points that loses this is passed over; and the
+    front of the plane at infinity; a fit to more points that loses this is rejected; and the
     Gauss-Newton steps multiply by exponentials of trace-free matrices, whose determinant is 1.
 
     Args:
@@ -121,7 +121,7 @@ def _gauss_newton_step(pairs: Pairs, kernel_weights: FloatArray, before: FloatAr
     """One step of the transfer error, as `sim3.Refit`, on the right perturbation of SL(4).
 
     The Jacobian is taken midway between a and the pre-image of b. At a it would follow the noise of a
-    and pull the transform towards a smaller one; midway the normal equations are those of the
+    and bias the transform towards a smaller one; midway the normal equations are those of the
     inverse, and for an affine transform those of ``affine3``.
     """
     pre_image = transformed(_inverse(before), pairs.points_b)

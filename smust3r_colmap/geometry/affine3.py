@@ -123,7 +123,7 @@ class Affine3(Transform):
         """The similarity of the same volume and nearest rotation that agrees with it at ``centre_a`` (..., 3).
 
         The rotation is the polar factor of the linear part, the scale the cube root of its determinant;
-        what is lost is told by ``anisotropy``.
+        ``anisotropy`` measures what is lost.
         """
         centre = np.asarray(centre_a, dtype=np.float64)
         scale, rotation = np.cbrt(determinant(self.linear)), nearest_rotation(self.linear)

@@ -28,7 +28,7 @@ def embed(larger: type[Transform], smaller: type[Transform]) -> FloatArray:
 
     ``larger.exp(E @ x)`` is the same map as ``smaller.exp(x)``. An information matrix comes down by
     ``E.T @ information @ E``, and goes up by ``P.T @ information @ P`` with ``P = pinv(E)``, which
-    knows nothing of the directions that the smaller group does not have.
+    has no information in the directions that the smaller group lacks.
 
     Raises:
         ValueError: the second group is not inside the first.

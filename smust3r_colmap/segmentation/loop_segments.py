@@ -231,7 +231,7 @@ def _automatic_thresholds(statistics: SimilarityStatistics) -> tuple[float, floa
 # ----------------------------------------------------------------------------- choosing
 @dataclass(frozen=True, kw_only=True)
 class _Rules:
-    """The arguments of ``plan_loops``, and what it made of them for this collection.
+    """The arguments of ``plan_loops``, and limits derived from them for this collection.
 
     Args:
         graph: the order of the images.

@@ -28,7 +28,7 @@ two sides of a loop are not neighbours."""
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FusedCameras:
-    """One pose per image of a connected part, with what the submodels said about each other.
+    """One pose per image of a connected part, with the disagreement of its submodels.
 
     Args:
         images: (N,) indices into the collection, ascending.
@@ -289,7 +289,7 @@ def build_scene(
     Args:
         collection: all images of the run.
         submodels: of this connected part; the first is the world frame. Submodels of loops are named too.
-        cameras, intrinsics, points: what the three fusions made of them.
+        cameras, intrinsics, points: their fused cameras, calibrations and cloud.
         metric: lengths are metres.
     """
     images = [collection.images[image] for image in cameras.images]

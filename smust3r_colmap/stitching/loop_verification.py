@@ -28,7 +28,7 @@ from smust3r_colmap.stitching.spanning_tree import ChainedPart
 MIN_END_IMAGES = 3
 """Images of each end that the loop submodel must hold and share with a window."""
 MAX_CLOSURE_SIGMAS = 5.0
-"""Between the way through the loop and the chain, per degree of freedom. The covariances are good to a
+"""Between the transform through the loop and that of the chain, per degree of freedom. The covariances are good to a
 factor of two or three, so this rejects gross errors and leaves the rest to the pose graph."""
 MIN_UNIT_INFORMATION = 1e-12
 """Information added to every direction of a matrix with unit diagonal."""

@@ -24,7 +24,7 @@ LOOP_STRENGTH_FACTOR = 1e-6
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ChainedPart:
-    """Submodels that hang together, in the frame of the first of them.
+    """Connected submodels, in the frame of the first of them.
 
     Args:
         submodels: positions in the list of all submodels; the first is the world frame.

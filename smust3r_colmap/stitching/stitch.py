@@ -43,7 +43,7 @@ UNKNOWN_GAP = ClosureGap(distance=np.nan, turn_deg=np.nan)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Stitching:
-    """One frame for whatever hangs together, without and with the loops.
+    """One frame per connected component, without and with the loops.
 
     Args:
         chained: the window submodels along their spanning trees, loops left out.
@@ -201,7 +201,7 @@ def closure_gap(
 ) -> ClosureGap:
     """Where the window of the second end puts its cameras, against where the loop puts them.
 
-    The loop submodel hangs on the window of the first end by their edge; its cameras of the second end
+    The loop submodel is placed by its edge to the window of the first end; its cameras of the second end
     are compared with those of the other window. NaN where the loop has no edges, where nothing
     connects the two windows, and as a distance where the cameras have no extent.
     """

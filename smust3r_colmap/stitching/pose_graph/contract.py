@@ -1,11 +1,11 @@
 """A pose graph without the nodes that only pass a measurement on, and the way back.
 
-A long sequence has few nodes with loops. Between them the edges are compounded into one, whose
-covariance is that of the whole stretch; the small graph that is left has the same minimum to first
-order about the present state and costs next to nothing to solve. ``expand`` then puts the left-out
-nodes back, each stretch bent by what its ends demand, shared out by the covariances of its edges.
-This is block elimination of the Gauss-Newton system, done in an order that lets whole batches of
-nodes go at once. The next module to read is ``levenberg``.
+A long sequence has few nodes with loops. The edges between two of them are compounded into one, whose
+covariance is that of the whole stretch. The small graph has the same minimum to first order about the
+present state and is cheap to solve. ``expand`` then restores the eliminated nodes: the change of each
+stretch is distributed over its edges by their covariances. This is block elimination of the
+Gauss-Newton system, in an order that eliminates whole batches of nodes at once.
+The next module to read is ``levenberg``.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Contraction:
 
 
 def contract(graph: PoseGraph, state: Transform, kept: BoolArray) -> Contraction:
-    """Takes out every node that hangs on one odometry edge, or on two edges of one kind (odometry, or one loop).
+    """Eliminates every node that has one odometry edge only, or on two edges of one kind (odometry, or one loop).
 
     Parallel edges of one kind are averaged under their information first.
 
@@ -96,7 +96,7 @@ def contract(graph: PoseGraph, state: Transform, kept: BoolArray) -> Contraction
 
 @dataclass(frozen=True, eq=False)
 class _Edges:
-    """Edges linearised about a state: each wants its source moved by ``offset`` relative to its target.
+    """Edges linearised about a state: the minimum of each moves its source by ``offset`` relative to its target.
 
     The cost of an edge is ``(e - offset)^T information (e - offset)`` when its
     ``target_from_source`` becomes ``X_t^-1 X_s exp(e)``.
@@ -232,7 +232,7 @@ def _take_out(edges: _Edges, chosen: IntArray, state: Transform) -> tuple[_Round
         before=first.target,
         after=np.full(len(chosen), -1),
         offset=np.zeros_like(first.offset),
-        # What hangs on one edge takes all that the edge wants; read as node_from_before.
+        # A node with one edge takes the whole offset of that edge; read as node_from_before.
         last_offset=first.turned(~between, state).offset,
         share=np.zeros_like(first.information),
     )
