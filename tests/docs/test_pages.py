@@ -183,6 +183,12 @@ def anchors(page: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_paths_of_the_repository_exist(page: Path) -> None:
+    paths = re.findall(r"(?<![\w/.])(?:scripts|smust3r_colmap|exporters|importers|tests)/[\w/]+\.py\b", text_of(page))
+    assert [path for path in paths if not (ROOT / path).is_file()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_links_lead_somewhere(page: Path) -> None:
     text = re.sub(r"```.*?```", "", text_of(page), flags=re.S)
     for link in re.findall(r"\]\(([^)\s]+)\)", text):
