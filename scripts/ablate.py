@@ -311,7 +311,7 @@ class SimulatedSet:
         num_false = self.num_false_loops(config, configuration.false_share)
         backbone = self._backbone(config, num_false)
         segments = plan_segments(backbone, config)
-        result = backbone.reconstruct(segments.all, with_maps=range(len(segments.all)))
+        result = backbone.reconstruct(segments.all, segments.view_graph, with_maps=range(len(segments.all)))
         false_loops = {maps.submodel.segment for maps in simulated_maps(result) if maps.geometry.false_loop}
         started = time.process_time()
         solved = solve(result, segments, self.truth.names, config)

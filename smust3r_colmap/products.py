@@ -7,7 +7,6 @@ Every value is complete and checked when it is born. The next module to read is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Protocol
@@ -128,12 +127,6 @@ class Segment:
     def __post_init__(self) -> None:
         if len(set(self.images)) != len(self.images) or not self.images:
             raise ValueError(f"segment {self.index}: images must be distinct and at least one")
-
-
-def consecutive_runs(images: Sequence[int]) -> tuple[tuple[int, ...], ...]:
-    """Ascending image indices cut wherever one is missing: the two sides of a loop segment."""
-    cuts = np.flatnonzero(np.diff(images) != 1) + 1
-    return tuple(tuple(int(image) for image in run) for run in np.split(np.asarray(images, dtype=np.int64), cuts))
 
 
 # --------------------------------------------------------------------- reconstruction

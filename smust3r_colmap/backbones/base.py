@@ -25,6 +25,7 @@ from smust3r_colmap.products import (
     SegmentReconstruction,
     Submodel,
 )
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,11 +72,14 @@ class Backbone(Protocol):
         Cosines between them tell which images may show one place (paper section III-F).
         """
 
-    def reconstruct(self, segments: Sequence[Segment], *, with_maps: Collection[int]) -> BackboneResult:
+    def reconstruct(
+        self, segments: Sequence[Segment], view_graph: ViewGraph, *, with_maps: Collection[int]
+    ) -> BackboneResult:
         """All segments. Failed geometry is recorded in the result, never raised.
 
         Args:
             segments: of the run, windows and loops; ``segments[k].index == k``.
+            view_graph: of the images of the run: their order, and which may see the same place.
             with_maps: indices of the segments whose dense maps will be read; those of the others may be empty.
         """
 

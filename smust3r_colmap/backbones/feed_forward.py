@@ -30,6 +30,7 @@ from smust3r_colmap.products import (
     Submodel,
     UnregisteredImage,
 )
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.storage.dense_maps import ImageMaps, StoredMaps, write_maps
 from smust3r_colmap.storage.digest import digest_of
 from smust3r_colmap.storage.run_directory import (
@@ -156,9 +157,11 @@ class FeedForwardBackbone:
         descriptors: npt.NDArray[np.float32] = read_arrays(stored.path / "descriptors.safetensors")["descriptors"]
         return descriptors
 
-    def reconstruct(self, segments: Sequence[Segment], *, with_maps: Collection[int]) -> BackboneResult:
+    def reconstruct(
+        self, segments: Sequence[Segment], view_graph: ViewGraph, *, with_maps: Collection[int]
+    ) -> BackboneResult:
         """See ``Backbone``; a network makes the maps anyway, so every segment has them."""
-        del with_maps
+        del view_graph, with_maps
         folders = [self._folder(segment) for segment in segments]
         with self.run.clock.stage(self.name, total=sum(len(segment.images) for segment in segments)) as stage:
             for segment, folder in zip(segments, folders, strict=True):

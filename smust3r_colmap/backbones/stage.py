@@ -63,7 +63,8 @@ def reconstruct(
         ReconstructionError: no segment gave a single submodel.
     """
     with_maps = _segments_with_maps(backbone, segments, alignment)
-    result = without_masked_depth(backbone.reconstruct(segments.all, with_maps=with_maps), collection)
+    result = backbone.reconstruct(segments.all, segments.view_graph, with_maps=with_maps)
+    result = without_masked_depth(result, collection)
     if not result.submodels:
         attempts = [f"segment {one.segment}: {'; '.join(one.attempts)}" for one in result.reconstructions]
         raise ReconstructionError(

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from smust3r_colmap.geometry.arrays import FloatArray, Pair
 from smust3r_colmap.geometry.sim3 import invert_rigid
-from smust3r_colmap.products import Segment, consecutive_runs
+from smust3r_colmap.products import Segment
 
 MAX_TURN_DEG = 60.0
 """Between the viewing directions of two cameras; beyond, their images rarely overlap."""
@@ -30,16 +30,17 @@ def plan_pairs(segment: Segment, *, neighbours: int, exhaustive_below: int) -> t
     return _near_pairs(images, neighbours)
 
 
-def plan_loop_pairs(segment: Segment, descriptors: npt.NDArray[np.float32], *, neighbours: int) -> tuple[Pair, ...]:
+def plan_loop_pairs(
+    runs: Sequence[Sequence[int]], descriptors: npt.NDArray[np.float32], *, neighbours: int
+) -> tuple[Pair, ...]:
     """Pairs (i < j) of a loop segment: each end like a window, and across the most similar.
 
     Across, each image is paired with the ``neighbours`` images of the other end with the most similar descriptors:
     half of all pairs, and nine tenths of the verified matches (six loops of two walks).
 
     Args:
-        segment: of kind ``"loop"``. descriptors: (N, D) unit vectors of all images of the collection.
+        runs: the images of either end, in order. descriptors: (N, D) unit vectors of all images of the collection.
     """
-    runs = consecutive_runs(segment.images)
     pairs = [pair for run in runs for pair in _near_pairs(run, neighbours)]
     for first, second in combinations(runs, 2):
         similarity = descriptors[list(first)] @ descriptors[list(second)].T

@@ -8,7 +8,7 @@ The next module to read is ``windows``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, get_args
 
@@ -99,6 +99,13 @@ class ViewGraph:
             weights=np.concatenate([self.weights, new_weights])[kept],
             reasons=np.concatenate([self.reasons, new_reasons])[kept],
         )
+
+    def within(self, images: Sequence[int]) -> ViewGraph:
+        """The graph with the pairs between these images only."""
+        is_inside = np.zeros(self.num_images, dtype=np.bool_)
+        is_inside[list(images)] = True
+        kept = is_inside[self.pairs].all(axis=1)
+        return replace(self, pairs=self.pairs[kept], weights=self.weights[kept], reasons=self.reasons[kept])
 
     # --------------------------------------------------------------------------- pairs
     def neighbours(self, image: int) -> IntArray:

@@ -2,7 +2,9 @@
 
     truth = TrueScene.from_demo(200, 72, 96)
     backbone = SimulatedBackbone(truth, collection_of(truth), PRESETS["network"], seed=0)
-    result = backbone.reconstruct(plan_windows(ViewGraph.chain(200), segment_length=60, overlap=30), with_maps=range(6))
+    graph = ViewGraph.chain(200)
+    windows = plan_windows(graph, segment_length=60, overlap=30)
+    result = backbone.reconstruct(windows, graph, with_maps=range(6))
 
 Everything stays in memory; maps are made when they are read. The errors of a segment depend on the seed, its images and
 its kind alone. The next module to read is ``truth``.
@@ -31,6 +33,7 @@ from smust3r_colmap.products import (
     Submodel,
     UnregisteredImage,
 )
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.storage.run_directory import key_of
 from smust3r_colmap.synthetic.descriptors import (
     NO_OVERLAP,
@@ -226,8 +229,11 @@ class SimulatedBackbone:
         descriptors: Float32Array = self._descriptors.copy()
         return descriptors
 
-    def reconstruct(self, segments: Sequence[Segment], *, with_maps: Collection[int]) -> BackboneResult:
+    def reconstruct(
+        self, segments: Sequence[Segment], view_graph: ViewGraph, *, with_maps: Collection[int]
+    ) -> BackboneResult:
         """All segments; see ``Backbone``. Every submodel has maps, whatever ``with_maps``: unread they cost nothing."""
+        del view_graph, with_maps
         made = [self._segment(segment) for segment in segments]
         return BackboneResult(
             reconstructions=tuple(reconstruction for reconstruction, _ in made),

@@ -32,12 +32,14 @@ from smust3r_colmap.geometry.camera import pointmap_from_depth
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.products import ImageCollection, Segment, SourceImage, UnregisteredImage
 from smust3r_colmap.report.summary import RunSummary
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.storage.dense_maps import ImageMaps
 from smust3r_colmap.synthetic.room import write_demo
 
 WIDTH, HEIGHT, NUM_IMAGES = 40, 30, 6
 CAMERA = pinhole(4 * WIDTH, 4 * HEIGHT, 130)
 WINDOW = Segment(index=0, images=(0, 1, 2, 3))
+ORDER = ViewGraph.chain(6)
 LOOP = Segment(index=1, images=(0, 1, 4, 5), kind="loop")
 
 Spoil = Callable[[PredictedImage], PredictedImage]
@@ -126,7 +128,7 @@ def start(
     with quiet_run(folder, Heard()) as run:
         predictor: Predictor = network
         backbone: Backbone = FeedForwardBackbone(predictor, collection or photographs(), run)
-        return backbone.reconstruct(segments or (WINDOW,), with_maps=())
+        return backbone.reconstruct(segments or (WINDOW,), ORDER, with_maps=())
 
 
 # ------------------------------------------------------------------------------ what comes back
@@ -154,7 +156,7 @@ def test_notes_are_told_and_stand_among_the_attempts(tmp_path: Path) -> None:
     heard = Heard()
     with quiet_run(tmp_path / "run", heard) as run:
         network = CountingNetwork(notes=("half the keyframes",))
-        result = FeedForwardBackbone(network, photographs(), run).reconstruct([WINDOW], with_maps=())
+        result = FeedForwardBackbone(network, photographs(), run).reconstruct([WINDOW], ORDER, with_maps=())
     assert heard.notes == ["segment 0: half the keyframes"]
     assert result.reconstructions[0].attempts == ("looked", "half the keyframes")
 

@@ -35,9 +35,11 @@ from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.images import load_rgb
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.products import ImageCollection, Segment, SourceImage
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.storage.run_directory import RunDirectory
 
 NUM_IMAGES = 12
+ORDER = ViewGraph.chain(5)
 GREY_STEP = 20
 UNIT_M = 0.37
 """Length of the stand-in's unit."""
@@ -215,7 +217,7 @@ def test_cameras_and_depth_come_through_as_they_are(
     collection = photographs(tmp_path / "images", room, cameras)
     backbone = backbone_of(collection, run, checkpoint)
     assert (backbone.name, backbone.metric, backbone.has_tracks) == ("vggt", False, False)
-    result = backbone.reconstruct([Segment(index=0, images=(0, 1, 2))], with_maps=[0])
+    result = backbone.reconstruct([Segment(index=0, images=(0, 1, 2))], ORDER, with_maps=[0])
 
     (submodel,), (maps,) = result.submodels, result.dense
     assert submodel.images == (0, 1, 2)
@@ -248,7 +250,7 @@ def test_at_the_trained_size_a_photograph_is_518_wide(
     collection = photographs(tmp_path / "images", room, [CAMERAS["landscape"]] * 2)
     predictor = backbone_of(collection, run, checkpoint, {"size": "518"}).predictor
     backbone = FeedForwardBackbone(predictor, collection, run_in(run))
-    maps = backbone.reconstruct([Segment(index=0, images=(0, 1))], with_maps=[0]).dense[0]
+    maps = backbone.reconstruct([Segment(index=0, images=(0, 1))], ORDER, with_maps=[0]).dense[0]
     assert room.inputs[0].shape == (1, 2, 3, 392, 518)
     assert maps.depth(1).shape == (392, 518)
 
@@ -275,7 +277,7 @@ def test_the_network_sees_the_middle_of_the_image_with_white_around(
     gradient = np.stack([columns, rows, np.full_like(rows, 40)], axis=-1).astype(np.uint8)
     gradient[60:100, 40:80] = 0  # the middle, by which the stand-in knows it
     Image.fromarray(gradient).save(collection.images[0].path)
-    backbone_of(collection, run, checkpoint).reconstruct([Segment(index=0, images=(0, 1))], with_maps=[])
+    backbone_of(collection, run, checkpoint).reconstruct([Segment(index=0, images=(0, 1))], ORDER, with_maps=[])
     (seen,) = room.inputs
     assert seen.shape == (1, 2, 3, SIZE, SIZE)
     portrait, panorama = seen[0].numpy() * 255
@@ -317,7 +319,9 @@ def test_a_network_that_is_sure_of_nothing_is_doubted(
 ) -> None:
     collection = photographs(tmp_path / "images", room, [CAMERAS["landscape"]] * 3)
     room.confidence = 1.02
-    result = backbone_of(collection, run, checkpoint).reconstruct([Segment(index=0, images=(0, 1, 2))], with_maps=[])
+    result = backbone_of(collection, run, checkpoint).reconstruct(
+        [Segment(index=0, images=(0, 1, 2))], ORDER, with_maps=[]
+    )
     assert result.reconstructions[0].warnings == ("VGGT is sure of 0.0 % of the pixels only, 5 % are needed",)
     assert len(result.submodels) == 1
 
@@ -329,7 +333,7 @@ def test_an_image_without_camera_or_file_is_left_out(
     room.lost = (2,)
     collection.images[3].path.unlink()
     result = backbone_of(collection, run, checkpoint).reconstruct(
-        [Segment(index=0, images=tuple(range(5)))], with_maps=[]
+        [Segment(index=0, images=tuple(range(5)))], ORDER, with_maps=[]
     )
     (reconstruction,) = result.reconstructions
     assert reconstruction.submodels[0].images == (0, 1, 4)
@@ -359,9 +363,9 @@ def test_a_segment_too_large_for_the_card_says_the_way_out_and_is_not_kept(
     segment = Segment(index=3, images=(0, 1))
     room.too_large = True
     with pytest.raises(ReconstructionError, match=r"segment 3: 2 images of 140x112 px do not fit.*--segment-length"):
-        backbone.reconstruct([segment], with_maps=[])
+        backbone.reconstruct([segment], ORDER, with_maps=[])
     room.too_large = False
-    assert len(backbone.reconstruct([segment], with_maps=[]).submodels) == 1
+    assert len(backbone.reconstruct([segment], ORDER, with_maps=[]).submodels) == 1
 
 
 # ------------------------------------------------------------------------------ options and weights

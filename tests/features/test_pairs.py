@@ -26,7 +26,7 @@ def test_a_loop_pairs_each_end_like_a_window_and_across_the_most_alike() -> None
     descriptors = np.zeros((100, 64), np.float32)
     for k in range(21):  # image 10 + k shows what image 70 + k shows, and a little of the next ones
         descriptors[10 + k, 2 * k : 2 * k + 4] = descriptors[70 + k, 2 * k : 2 * k + 4] = 0.5
-    pairs = plan_loop_pairs(Segment(index=3, images=ends, kind="loop"), descriptors, neighbours=3)
+    pairs = plan_loop_pairs((ends[:21], ends[21:]), descriptors, neighbours=3)
     window = set(plan_pairs(Segment(index=0, images=tuple(range(60))), neighbours=3, exhaustive_below=25))
     across = {pair for pair in pairs if pair[0] < 60 <= pair[1]}
     inside = set(pairs) - across

@@ -16,6 +16,7 @@ from smust3r_colmap.features.pairs import plan_pairs
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.products import Segment
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 
 NUM_IMAGES = 8
 
@@ -53,6 +54,7 @@ def synthetic_segment(folder: Path) -> SyntheticSegment:
         images=images,
         camera_indices=(0,) * NUM_IMAGES,
         pairs=plan_pairs(Segment(index=0, images=images), neighbours=8, exhaustive_below=25),
+        view_graph=ViewGraph.chain(NUM_IMAGES),
         cameras=(start,),
         known_cameras={},
         seed=0,

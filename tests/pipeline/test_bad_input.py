@@ -122,7 +122,7 @@ class Run:
 def simulated(truth: TrueScene, config: RunConfig = CONFIG, settings: SimulationSettings = NETWORK) -> Run:
     backbone = SimulatedBackbone(truth, collection_of(truth), settings, seed=0)
     segments = ablate.plan_segments(backbone, config)
-    result = backbone.reconstruct(segments.all, with_maps=range(len(segments.all)))
+    result = backbone.reconstruct(segments.all, segments.view_graph, with_maps=range(len(segments.all)))
     return Run(truth=truth, config=config, result=result, segments=segments)
 
 

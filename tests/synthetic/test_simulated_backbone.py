@@ -37,6 +37,7 @@ from smust3r_colmap.synthetic.truth import TYPICAL_DEPTH_IMAGES, TrueScene, coll
 PERFECT = PRESETS["perfect"]
 HEIGHT, WIDTH, NUM_IMAGES = 48, 64, 120
 WINDOW = Segment(index=0, images=tuple(range(REFERENCE_LENGTH + 1)))
+ORDER = ViewGraph.chain(NUM_IMAGES)
 TRUE_LOOP = Segment(index=7, images=(*range(10), *range(110, 120)), kind="loop")
 """The two ends of the round: the same place."""
 
@@ -58,7 +59,7 @@ def one_submodel(
 
 
 def submodels_of(backbone: SimulatedBackbone, segments: Sequence[Segment]) -> tuple[SimulatedMaps, ...]:
-    return simulated_maps(backbone.reconstruct(segments, with_maps=range(len(segments))))
+    return simulated_maps(backbone.reconstruct(segments, ORDER, with_maps=range(len(segments))))
 
 
 def aligned(target: SimulatedMaps, source: SimulatedMaps) -> SubmodelFit:
@@ -143,7 +144,7 @@ def test_intrinsics_have_the_size_of_the_collection(truth: TrueScene) -> None:
     small = collection_of(truth)
     images = tuple(replace(image, width=640, height=480) for image in small.images)
     large = ImageCollection(images=images, cameras=(truth.intrinsics.resized(640, 480),))
-    result = SimulatedBackbone(truth, large, PERFECT).reconstruct([WINDOW], with_maps=[0])
+    result = SimulatedBackbone(truth, large, PERFECT).reconstruct([WINDOW], ORDER, with_maps=[0])
     assert result.submodels[0].intrinsics[0].params == pytest.approx(demo_intrinsics(640, 480).params)
     np.testing.assert_array_equal(result.dense[0].pointmap_seg(3), one_submodel(truth, PERFECT).pointmap_seg(3))
 
@@ -151,7 +152,7 @@ def test_intrinsics_have_the_size_of_the_collection(truth: TrueScene) -> None:
 def test_a_simulated_backbone_is_a_backbone(truth: TrueScene) -> None:
     backbone: Backbone = simulated(truth, PERFECT)
     assert (backbone.name, backbone.metric, backbone.has_tracks) == ("simulated", True, False)
-    result = backbone.reconstruct([WINDOW], with_maps=[])
+    result = backbone.reconstruct([WINDOW], ORDER, with_maps=[])
     assert result.matches is None
     assert result.rejected == ()
     assert result.reconstructions[0].metric
@@ -342,14 +343,14 @@ def test_a_segment_comes_out_the_same_whatever_else_is_asked(truth: TrueScene) -
 
 def test_seeds_segments_and_settings_differ(truth: TrueScene) -> None:
     settings = SimulationSettings()
-    base = simulated(truth, settings).reconstruct([WINDOW], with_maps=[])
-    other_seed = simulated(truth, settings, seed=1).reconstruct([WINDOW], with_maps=[])
+    base = simulated(truth, settings).reconstruct([WINDOW], ORDER, with_maps=[])
+    other_seed = simulated(truth, settings, seed=1).reconstruct([WINDOW], ORDER, with_maps=[])
     assert np.abs(base.dense[0].depth(0) - other_seed.dense[0].depth(0)).max() > 1e-3
     shorter = replace(WINDOW, images=WINDOW.images[:-1])
     assert np.abs(base.dense[0].depth(0) - one_submodel(truth, settings, shorter).depth(0)).max() > 1e-3
-    hard = simulated(truth, PRESETS["hard"]).reconstruct([WINDOW], with_maps=[])
+    hard = simulated(truth, PRESETS["hard"]).reconstruct([WINDOW], ORDER, with_maps=[])
     assert len({base.dense_key, other_seed.dense_key, hard.dense_key}) == 3
-    assert base.dense_key == simulated(truth, settings).reconstruct([WINDOW], with_maps=[0]).dense_key
+    assert base.dense_key == simulated(truth, settings).reconstruct([WINDOW], ORDER, with_maps=[0]).dense_key
     assert np.abs(simulated(truth, settings).describe() - simulated(truth, settings, seed=1).describe()).max() > 1e-3
 
 
@@ -382,7 +383,7 @@ def test_maps_are_made_when_they_are_read(truth: TrueScene) -> None:
     views = CountedViews(truth)
     counted = replace(truth, views=views)
     windows = plan_windows(ViewGraph.chain(NUM_IMAGES), segment_length=60, overlap=30)
-    result = simulated(counted, SimulationSettings()).reconstruct(windows, with_maps=range(3))
+    result = simulated(counted, SimulationSettings()).reconstruct(windows, ORDER, with_maps=range(3))
     assert len(views.depths) <= TYPICAL_DEPTH_IMAGES + 1, "some for the size of the scene, one for the key"
     assert len(views.rgbs) <= 1
     before = len(views.depths)
@@ -526,14 +527,14 @@ def test_the_stronger_evidence_decides_what_is_taken_for_what() -> None:
 # ---------------------------------------------------------------------------------- failures
 def test_segments_fail_and_images_drop_in_the_stated_share(truth: TrueScene) -> None:
     segments = [Segment(index=k, images=tuple(range(k, k + 20))) for k in range(100)]
-    failing = simulated(truth, replace(PERFECT, failed_share=0.3)).reconstruct(segments, with_maps=[])
+    failing = simulated(truth, replace(PERFECT, failed_share=0.3)).reconstruct(segments, ORDER, with_maps=[])
     failed = [one for one in failing.reconstructions if not one.submodels]
     assert 20 < len(failed) < 40
     assert len(failing.dense) == len(failing.submodels) == 100 - len(failed)
     assert len(failed[0].unregistered) == 20
     assert "simulation fails" in failed[0].unregistered[0].reason
 
-    dropping = simulated(truth, replace(PERFECT, dropped_share=0.1)).reconstruct(segments, with_maps=[])
+    dropping = simulated(truth, replace(PERFECT, dropped_share=0.1)).reconstruct(segments, ORDER, with_maps=[])
     dropped = sum(len(one.unregistered) for one in dropping.reconstructions)
     assert 150 < dropped < 250
     for one, segment in zip(dropping.reconstructions, segments, strict=True):

@@ -50,6 +50,7 @@ from smust3r_colmap.products import (
     Submodel,
     UnregisteredImage,
 )
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.storage.dense_maps import EmptyMaps, StoredMaps
 from smust3r_colmap.storage.run_directory import StageFolder, key_of
 
@@ -95,10 +96,12 @@ class ClassicalBackbone:
         """VLAD of the SIFT features of every image; see ``Backbone``."""
         return describe_images(self.run, self._features)
 
-    def reconstruct(self, segments: Sequence[Segment], *, with_maps: Collection[int]) -> BackboneResult:
+    def reconstruct(
+        self, segments: Sequence[Segment], view_graph: ViewGraph, *, with_maps: Collection[int]
+    ) -> BackboneResult:
         """All segments of the run; see ``Backbone``."""
-        pairs = self._match(segments)
-        reconstructions = [_reconstruction(one) for one in self._map(segments, pairs)]
+        pairs = self._match(segments, view_graph)
+        reconstructions = [_reconstruction(one) for one in self._map(segments, pairs, view_graph)]
         dense, dense_key = self._dense([p for r in reconstructions for p in r.submodels], with_maps)
         return BackboneResult(
             reconstructions=tuple(reconstructions),
@@ -114,28 +117,32 @@ class ClassicalBackbone:
     def _features(self) -> RunFeatures:
         return self._extract()
 
-    def _match(self, segments: Sequence[Segment]) -> dict[int, tuple[Pair, ...]]:
+    def _match(self, segments: Sequence[Segment], view_graph: ViewGraph) -> dict[int, tuple[Pair, ...]]:
         """The matched pairs by segment. Pairs that failed are in no key, so what comes later is not final either."""
         descriptors = self.describe() if any(segment.kind == "loop" for segment in segments) else None
-        plan = {segment.index: self._pairs(segment, descriptors) for segment in segments}
+        plan = {segment.index: self._pairs(segment, view_graph, descriptors) for segment in segments}
         every_pair = {pair for pairs in plan.values() for pair in pairs}
         matched = match_pairs_of_run(self.run, self._features, every_pair)
         return {index: tuple(pair for pair in pairs if pair in matched) for index, pairs in plan.items()}
 
-    def _pairs(self, segment: Segment, descriptors: npt.NDArray[np.float32] | None) -> tuple[Pair, ...]:
+    def _pairs(
+        self, segment: Segment, view_graph: ViewGraph, descriptors: npt.NDArray[np.float32] | None
+    ) -> tuple[Pair, ...]:
         neighbours = self.config.match_neighbours
         if segment.kind == "loop":
             assert descriptors is not None, "loops are found by descriptors"
-            return plan_loop_pairs(segment, descriptors, neighbours=neighbours)
+            return plan_loop_pairs(view_graph.runs(segment.images), descriptors, neighbours=neighbours)
         return plan_pairs(segment, neighbours=neighbours, exhaustive_below=self.exhaustive_below)
 
     # --------------------------------------------------------------- every segment
-    def _map(self, segments: Sequence[Segment], pairs: Mapping[int, tuple[Pair, ...]]) -> list[MappedSegment]:
+    def _map(
+        self, segments: Sequence[Segment], pairs: Mapping[int, tuple[Pair, ...]], view_graph: ViewGraph
+    ) -> list[MappedSegment]:
         """Map the segments with one calibration for the run; see ``calibration``.
 
         Only windows determine the cameras, so a loop that is found later changes no window.
         """
-        tasks = {segment.index: self._mapping_task(segment, pairs[segment.index]) for segment in segments}
+        tasks = {segment.index: self._mapping_task(segment, pairs[segment.index], view_graph) for segment in segments}
         if self.collection.calibrated:
             mapped = self._map_all("mapping", list(tasks.values()))
             return [mapped[segment.index] for segment in segments]
@@ -220,7 +227,14 @@ class ClassicalBackbone:
         return {one.segment: one for one in calibrated}
 
     def _mapping_key(self, task: MappingTask) -> str:
-        inputs = (self._features.key, self.run.seed, task.images, task.pairs, sorted(task.known_cameras.items()))
+        inputs = (
+            self._features.key,
+            self.run.seed,
+            task.images,
+            task.pairs,
+            task.view_graph.pairs,
+            sorted(task.known_cameras.items()),
+        )
         return key_of("mapping", METHOD_VERSION, *inputs)
 
     def _agreed_cameras(
@@ -238,13 +252,14 @@ class ClassicalBackbone:
             for kind, count in least.items()
         }
 
-    def _mapping_task(self, segment: Segment, pairs: tuple[Pair, ...]) -> MappingTask:
+    def _mapping_task(self, segment: Segment, pairs: tuple[Pair, ...], view_graph: ViewGraph) -> MappingTask:
         return MappingTask(
             segment=segment.index,
             database=self._features.database,
             images=segment.images,
             camera_indices=tuple(self.collection.images[i].camera for i in segment.images),
             pairs=pairs,
+            view_graph=view_graph.within(segment.images),
             cameras=self.collection.cameras,
             known_cameras=dict(enumerate(self.collection.cameras)) if self.collection.calibrated else {},
             seed=self.run.seed,

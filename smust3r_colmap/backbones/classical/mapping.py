@@ -54,7 +54,7 @@ MIN_LINKED_PAIRS = 3
 """Pairs that match across two models before another strategy is tried on them. One or two hardly determine the scale
 between the models; further strategies took 10 s and registered no image more."""
 NEAR_OFFSET_IMAGES = 4
-"""Largest difference of the indices of a pair that is kept where pairs farther apart led to a wrong model."""
+"""Largest distance in order of a pair that is kept where pairs farther apart led to a wrong model."""
 MAX_ERROR_PX = 3.0
 """Mean reprojection error above which a model is rejected."""
 CLEARLY_MORE_RATIO = 1.05
@@ -209,7 +209,8 @@ class SegmentMapper:
 
     def _mapped_with_near_pairs(self, name: str) -> list[MappedModel]:
         """Parts of the models from pairs of images that are near in the sequence."""
-        pairs = tuple(pair for pair in self.task.pairs if pair[1] - pair[0] <= NEAR_OFFSET_IMAGES)
+        graph = self.task.view_graph
+        pairs = tuple(pair for pair in self.task.pairs if graph.steps_between(*pair) <= NEAR_OFFSET_IMAGES)
         database = self._scratch / "near.db"
         build_database(database, pairs, self.task)
         strategy = from_start_pairs(f"{name}, near pairs", database, pairs, self.task)
@@ -252,11 +253,13 @@ class SegmentMapper:
 
     def _count_unconfirmed(self, models: Sequence[MappedModel]) -> int:
         with open_database(self.task.database) as database:
-            return sum(len(find_unconfirmed_poses(model, self.inliers, database)) for model in models)
+            return sum(
+                len(find_unconfirmed_poses(model, self.task.view_graph, self.inliers, database)) for model in models
+            )
 
     def _epipolar_outliers(self, model: MappedModel) -> list[int]:
         with open_database(self.task.database) as database:
-            return find_epipolar_outliers(model, self.inliers, database)
+            return find_epipolar_outliers(model, self.task.view_graph, self.inliers, database)
 
     def _split(self, model: MappedModel) -> list[MappedModel]:
         """The parts of a model between epipolar outliers and weak links, those that are large enough."""

@@ -17,6 +17,7 @@ from smust3r_colmap.backbones.classical.mapped_model import MappedModel
 from smust3r_colmap.geometry.arrays import Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 
 MAX_TURN_DEG = 60.0
 """Largest rotation between consecutive images that match (correct walks: 52 at most; wrong models: 150)."""
@@ -70,24 +71,24 @@ def diverged_focal(model: MappedModel, camera_of: Mapping[int, int], known_camer
     return f"focal length {focal[k]:.0f} px, the run's is {known[k]:.0f} px"
 
 
-def find_inconsistent_poses(model: MappedModel, inliers: Mapping[Pair, int]) -> list[int]:
+def find_inconsistent_poses(model: MappedModel, graph: ViewGraph, inliers: Mapping[Pair, int]) -> list[int]:
     """Positions k where ``model.images[k]`` and the next image of the sequence match but are posed far apart.
 
     A pair is tested if its images are consecutive and it has STRONG_PAIR_INLIERS verified matches. It is far apart
     with a rotation above MAX_TURN_DEG, or with a step above MAX_STEP_RATIO median steps and above MIN_STEP_DEPTH_RATIO
     of the median depth of what the first image sees.
     """
-    lengths = _step_lengths(model, inliers)
+    lengths = _step_lengths(model, graph, inliers)
     return [k for k in lengths if _turn_deg(model, k) > MAX_TURN_DEG or _is_too_far(model, k, lengths)]
 
 
-def _step_lengths(model: MappedModel, inliers: Mapping[Pair, int]) -> dict[int, float]:
+def _step_lengths(model: MappedModel, graph: ViewGraph, inliers: Mapping[Pair, int]) -> dict[int, float]:
     """How far the camera moved after position k, for every k whose image and the next are a tested pair."""
     centres = model.seg_from_cam[:, :, 3]
     return {
         k: float(np.linalg.norm(centres[k + 1] - centres[k]))
         for k, (first, second) in enumerate(pairwise(model.images))
-        if second - first == 1 and inliers.get((first, second), 0) >= STRONG_PAIR_INLIERS
+        if graph.steps_between(first, second) == 1 and inliers.get((first, second), 0) >= STRONG_PAIR_INLIERS
     }
 
 
@@ -101,18 +102,21 @@ def _is_too_far(model: MappedModel, k: int, lengths: Mapping[int, float]) -> boo
     return lengths[k] > MAX_STEP_RATIO * median and lengths[k] > MIN_STEP_DEPTH_RATIO * _median_depth(model, k)
 
 
-def find_unconfirmed_poses(model: MappedModel, inliers: Mapping[Pair, int], database: pycolmap.Database) -> list[int]:
+def find_unconfirmed_poses(
+    model: MappedModel, graph: ViewGraph, inliers: Mapping[Pair, int], database: pycolmap.Database
+) -> list[int]:
     """The inconsistent poses without rotations that CONFIRMED_TURN_SHARE of the verified matches confirm.
 
     Epipolar errors do not depend on the length of a step, so they cannot confirm a long one.
 
     Args:
+        graph: the order of the images.
         inliers: verified matches by pair. database: with the keypoints and the two-view geometries.
     """
-    lengths = _step_lengths(model, inliers)
+    lengths = _step_lengths(model, graph, inliers)
     return [
         k
-        for k in find_inconsistent_poses(model, inliers)
+        for k in find_inconsistent_poses(model, graph, inliers)
         if _is_too_far(model, k, lengths) or epipolar_inlier_share(model, k, k + 1, database) < CONFIRMED_TURN_SHARE
     ]
 
@@ -139,7 +143,9 @@ def find_weak_links(model: MappedModel) -> list[int]:
     return [k for k in range(len(model.images) - 1) if np.count_nonzero((first <= k) & (last > k)) < MIN_LINK_POINTS]
 
 
-def find_epipolar_outliers(model: MappedModel, inliers: Mapping[Pair, int], database: pycolmap.Database) -> list[int]:
+def find_epipolar_outliers(
+    model: MappedModel, graph: ViewGraph, inliers: Mapping[Pair, int], database: pycolmap.Database
+) -> list[int]:
     """Positions k such that the poses of image k and the next contradict verified matches.
 
     Of every pair of near images with STRONG_PAIR_INLIERS, most matches have to lie near their epipolar lines. That
@@ -147,21 +153,22 @@ def find_epipolar_outliers(model: MappedModel, inliers: Mapping[Pair, int], data
     agree. Images from the two ends of a loop are never near.
 
     Args:
+        graph: the order of the images.
         inliers: verified matches by pair. database: with the keypoints and the two-view geometries.
     """
     outliers = set()
-    for a, b in near_positions(model.images):
+    for a, b in near_positions(model.images, graph):
         strong = inliers.get((model.images[a], model.images[b]), 0) >= STRONG_PAIR_INLIERS
         if strong and epipolar_inlier_share(model, a, b, database) < MIN_EPIPOLAR_INLIER_SHARE:
             outliers.add(b - 1)
     return sorted(outliers)
 
 
-def near_positions(images: Sequence[int]) -> Iterator[tuple[int, int]]:
+def near_positions(images: Sequence[int], graph: ViewGraph) -> Iterator[tuple[int, int]]:
     """Positions (a, b) of images that are at most NEAR_STEPS apart in the sequence, a before b."""
     for a in range(len(images)):
         for b in range(a + 1, min(a + 1 + NEAR_STEPS, len(images))):
-            if images[b] - images[a] <= NEAR_STEPS:
+            if graph.steps_between(images[a], images[b]) <= NEAR_STEPS:
                 yield a, b
 
 

@@ -16,6 +16,7 @@ from smust3r_colmap.backbones.classical.thinning import thin_matches
 from smust3r_colmap.colmap.database import open_database, write_images
 from smust3r_colmap.geometry.arrays import Pair
 from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 
 MIN_SUBMODEL_IMAGES = 4
 """Smaller models are too weak to be a node; a smaller segment cannot have larger ones."""
@@ -34,6 +35,7 @@ class MappingTask:
     Args:
         segment: its index. database: the run's. images: indices in order, with their cameras.
         pairs: which of the database's pairs may be used; all of them have been matched.
+        view_graph: the pairs of the segment, with the order of its images.
         cameras: initial values by camera index.
         known_cameras: by camera index; empty for a calibration segment. They are held fixed where all cameras of the
             segment are known.
@@ -46,6 +48,7 @@ class MappingTask:
     images: tuple[int, ...]
     camera_indices: tuple[int, ...]
     pairs: tuple[Pair, ...]
+    view_graph: ViewGraph
     cameras: tuple[Intrinsics, ...]
     known_cameras: Mapping[int, Intrinsics]
     seed: int

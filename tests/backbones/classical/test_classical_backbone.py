@@ -20,8 +20,10 @@ from smust3r_colmap.backbones.classical.strategies import MappingTask
 from smust3r_colmap.config import ClassicalConfig
 from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.products import ImageCollection, RunFeatures, Segment, SourceImage
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 
 WINDOW = Segment(index=0, images=tuple(range(NUM_IMAGES)))
+ORDER = ViewGraph.chain(NUM_IMAGES)
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +65,10 @@ def die_in_the_global_mapper(task: MappingTask) -> MappedSegment:
 @pytest.mark.slow
 def test_a_segment_that_failed_is_tried_again_in_the_next_run(segment: SyntheticSegment, tmp_path: Path) -> None:
     with quiet_run(tmp_path / "out") as run:
-        (failed,) = backbone_of(segment, run, run_out_of_memory).reconstruct([WINDOW], with_maps=()).reconstructions
-        (mapped,) = backbone_of(segment, run, map_as_walk).reconstruct([WINDOW], with_maps=()).reconstructions
+        (failed,) = (
+            backbone_of(segment, run, run_out_of_memory).reconstruct([WINDOW], ORDER, with_maps=()).reconstructions
+        )
+        (mapped,) = backbone_of(segment, run, map_as_walk).reconstruct([WINDOW], ORDER, with_maps=()).reconstructions
     assert failed.submodels == ()
     assert {one.reason for one in failed.unregistered} == {"the mapping of segment 0 failed"}
     assert all(attempt.startswith("mapping: ") and "segment 0" in attempt for attempt in failed.attempts)
@@ -75,7 +79,9 @@ def test_a_segment_that_failed_is_tried_again_in_the_next_run(segment: Synthetic
 def test_a_global_mapper_that_aborts_its_process_is_left_out(segment: SyntheticSegment, tmp_path: Path) -> None:
     with quiet_run(tmp_path / "out") as run:
         (mapped,) = (
-            backbone_of(segment, run, die_in_the_global_mapper).reconstruct([WINDOW], with_maps=()).reconstructions
+            backbone_of(segment, run, die_in_the_global_mapper)
+            .reconstruct([WINDOW], ORDER, with_maps=())
+            .reconstructions
         )
     assert [submodel.images for submodel in mapped.submodels] == [tuple(range(6))]
 
@@ -84,7 +90,7 @@ def test_a_sweep_that_failed_gives_empty_maps(
     segment: SyntheticSegment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with quiet_run(tmp_path / "out") as run:
-        (maps,) = backbone_of(segment, run, map_as_walk).reconstruct([WINDOW], with_maps=[0]).dense
+        (maps,) = backbone_of(segment, run, map_as_walk).reconstruct([WINDOW], ORDER, with_maps=[0]).dense
         assert not list((tmp_path / "out").rglob("depth_0/*"))
     assert "segment 0 has no depth maps" in capsys.readouterr().err
     assert len(maps) == 6

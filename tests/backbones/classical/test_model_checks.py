@@ -23,6 +23,9 @@ from smust3r_colmap.backbones.classical.model_checks import (
 )
 from smust3r_colmap.colmap.database import open_database
 from smust3r_colmap.products import Tracks
+from smust3r_colmap.segmentation.view_graph import ViewGraph
+
+ORDER = ViewGraph.chain(50)
 
 
 def strong_neighbours(num_images: int) -> dict[tuple[int, int], int]:
@@ -30,19 +33,19 @@ def strong_neighbours(num_images: int) -> dict[tuple[int, int], int]:
 
 
 def test_a_walk_has_no_inconsistent_poses() -> None:
-    assert find_inconsistent_poses(model_of_walk(12), strong_neighbours(12)) == []
+    assert find_inconsistent_poses(model_of_walk(12), ORDER, strong_neighbours(12)) == []
 
 
 def test_a_large_rotation_between_matching_neighbours_is_inconsistent() -> None:
     model = model_of_walk(12)
     model.seg_from_cam[7:, :, :3] = model.seg_from_cam[7:, :, :3] @ rotation_about_y(150.0)
-    assert find_inconsistent_poses(model, strong_neighbours(12)) == [6]
+    assert find_inconsistent_poses(model, ORDER, strong_neighbours(12)) == [6]
 
 
 def test_a_long_step_between_matching_neighbours_is_inconsistent() -> None:
     model = model_of_walk(12)
     model.seg_from_cam[5:, 0, 3] += 15.0
-    assert find_inconsistent_poses(model, strong_neighbours(12)) == [4]
+    assert find_inconsistent_poses(model, ORDER, strong_neighbours(12)) == [4]
 
 
 def test_neighbours_that_do_not_match_may_be_far_apart() -> None:
@@ -50,22 +53,22 @@ def test_neighbours_that_do_not_match_may_be_far_apart() -> None:
     model.seg_from_cam[5:, 0, 3] += 15.0
     pairs = strong_neighbours(12)
     pairs[4, 5] = 12
-    assert find_inconsistent_poses(model, pairs) == []
+    assert find_inconsistent_poses(model, ORDER, pairs) == []
 
 
 def test_moving_on_after_a_pause_is_consistent() -> None:
     model = model_of_walk(12)
     model.seg_from_cam[:, 0, 3] *= 1e-3
     model.seg_from_cam[6:, 0, 3] += 0.5
-    assert find_inconsistent_poses(model, strong_neighbours(12)) == []
+    assert find_inconsistent_poses(model, ORDER, strong_neighbours(12)) == []
 
 
 def test_the_two_ends_of_a_loop_are_not_neighbours() -> None:
-    assert list(near_positions((3, 4, 5, 40, 41))) == [(0, 1), (0, 2), (1, 2), (3, 4)]
+    assert list(near_positions((3, 4, 5, 40, 41), ORDER)) == [(0, 1), (0, 2), (1, 2), (3, 4)]
     model = model_of_walk(12)
     model.seg_from_cam[5:, 0, 3] += 15.0
     far = replace(model, images=(*range(5), *range(40, 47)))
-    assert find_inconsistent_poses(far, {**strong_neighbours(47), (4, 40): 500}) == []
+    assert find_inconsistent_poses(far, ORDER, {**strong_neighbours(47), (4, 40): 500}) == []
 
 
 def test_epipolar_errors_tell_a_true_relative_pose_from_a_wrong_one() -> None:
@@ -129,13 +132,13 @@ def test_matches_that_contradict_a_model_name_the_position(tmp_path: Path) -> No
     (model,) = map_segment(task).models
     inliers = dict.fromkeys(task.pairs, 200)
     with open_database(task.database) as database:
-        assert find_inconsistent_poses(model, inliers)
-        assert find_unconfirmed_poses(model, inliers, database) == []
-        assert find_epipolar_outliers(model, inliers, database) == []
+        assert find_inconsistent_poses(model, ORDER, inliers)
+        assert find_unconfirmed_poses(model, ORDER, inliers, database) == []
+        assert find_epipolar_outliers(model, ORDER, inliers, database) == []
         model.seg_from_cam[5:, :, :3] = model.seg_from_cam[5:, :, :3] @ rotation_about_y(25.0)
-        assert 4 in find_epipolar_outliers(model, inliers, database)
-        assert not {0, 1, 2} & set(find_epipolar_outliers(model, inliers, database))
+        assert 4 in find_epipolar_outliers(model, ORDER, inliers, database)
+        assert not {0, 1, 2} & set(find_epipolar_outliers(model, ORDER, inliers, database))
         model.seg_from_cam[5:, :, :3] = model.seg_from_cam[5:, :, :3] @ rotation_about_y(90.0)
-        assert find_unconfirmed_poses(model, inliers, database) == [4]
+        assert find_unconfirmed_poses(model, ORDER, inliers, database) == [4]
         model.seg_from_cam[2:, 0, 3] += 1000.0
-        assert 1 in find_unconfirmed_poses(model, inliers, database), "epipolar errors do not depend on the step"
+        assert 1 in find_unconfirmed_poses(model, ORDER, inliers, database), "epipolar errors do not depend on the step"
