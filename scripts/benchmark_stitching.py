@@ -36,6 +36,7 @@ from smust3r_colmap.estimators.similarity import fit_similarity
 from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.sl4 import SL4
+from smust3r_colmap.geometry.so3 import angles_between, nearest_rotation
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.stitching.pose_graph.graph import PoseGraph
 from smust3r_colmap.stitching.pose_graph.optimise import GraphSolution, Kernel, optimise
@@ -140,13 +141,10 @@ def ate(truth: Transform, found: Transform) -> float:
 
 def mean_turn_deg(truth: Sim3, found: Transform) -> float:
     """Mean angle between true and found orientations, both relative to the first node's."""
-    linear = found.matrix[:, :3, :3]
-    u, _, vt = np.linalg.svd(linear)
-    rotation = u @ vt
+    rotation = nearest_rotation(found.matrix[:, :3, :3])
     relative = np.swapaxes(rotation[:1], 1, 2) @ rotation
     true = np.swapaxes(truth.rotation[:1], 1, 2) @ truth.rotation
-    cosine = (np.einsum("nij,nij->n", relative, true) - 1) / 2
-    return float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1))).mean())
+    return float(np.rad2deg(angles_between(relative, true)).mean())
 
 
 def timed(graph: PoseGraph, start: Transform, kernel: Kernel) -> tuple[GraphSolution, float]:

@@ -50,7 +50,7 @@ have the same errors and confirm anything."""
 CANDIDATES_PER_NEIGHBOUR = 3
 """Views with most shared points whose parallax is looked at, for each neighbour wanted."""
 CACHE_BYTES = 256 << 20
-"""Carried maps kept in memory, with what they are looked up by: two hundred of the usual size, and never fewer than
+"""Of warped maps and their lookups in memory: two hundred maps of typical size, and never fewer than
 two."""
 MIN_VIEW_COSINE = 0.5
 """Cosine between viewing directions above which two cameras without common points may see the same surface."""

@@ -14,8 +14,10 @@ import numpy.typing as npt
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.estimators.robust import CAUCHY, RobustLoss
 from smust3r_colmap.estimators.sim3 import Pairs, affine_matrix, fit_robustly, usable_pairs
+from smust3r_colmap.estimators.similarity import CentredPairs
 from smust3r_colmap.geometry.affine3 import Affine3
 from smust3r_colmap.geometry.arrays import FloatArray
+from smust3r_colmap.geometry.so3 import nearest_rotation
 from smust3r_colmap.geometry.transform import Transform
 from smust3r_colmap.products import TransformEstimate
 
@@ -73,16 +75,14 @@ def _symmetric_fit(pairs: Pairs, kernel_weights: FloatArray, before: FloatArray)
     """
     share = pairs.precision * kernel_weights
     share = share / share.sum()
-    mean_a, mean_b = share @ pairs.points_a, share @ pairs.points_b
-    a, b = pairs.points_a - mean_a, pairs.points_b - mean_b
+    centred = CentredPairs.of(pairs.points_a, pairs.points_b, share)
+    a, b = centred.a, centred.b
     refuse_plane(a, share, "first")
     refuse_plane(b, share, "second")
     _, whitener_a = _roots((share[:, None] * a).T @ a)
     root_b, whitener_b = _roots((share[:, None] * b).T @ b)
-    u, _, vt = np.linalg.svd(whitener_b @ ((share[:, None] * b).T @ a) @ whitener_a)
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    linear = root_b @ rotation @ whitener_a
-    return affine_matrix(linear, mean_b - linear @ mean_a)
+    linear = root_b @ nearest_rotation(whitener_b @ centred.correlation(share) @ whitener_a) @ whitener_a
+    return affine_matrix(linear, centred.mean_b - linear @ centred.mean_a)
 
 
 def refuse_plane(centred: FloatArray, share: FloatArray, side: str) -> None:
