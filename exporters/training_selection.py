@@ -19,6 +19,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from smust3r_colmap.colmap.reconstruction import SparseObservations
 from smust3r_colmap.errors import InputError
 from smust3r_colmap.exporters.centred_pinhole import CentredPinhole
 from smust3r_colmap.geometry.arrays import BoolArray, FloatArray, IntArray
@@ -108,11 +109,11 @@ def select_for_training(
     """
     image_ids = np.array(sorted(model.reg_image_ids()), dtype=np.int64)
     centres = np.array([model.image(int(i)).projection_center() for i in image_ids]).reshape(-1, 3)
-    xyz = np.array([point.xyz for point in model.points3D.values()], dtype=np.float64).reshape(-1, 3)
-    rgb = np.array([point.color for point in model.points3D.values()], dtype=np.uint8).reshape(-1, 3)
+    tracks = SparseObservations.of(model, image_ids.tolist())
+    xyz = tracks.xyz
 
     far_point = np.asarray(~np.isfinite(xyz).all(axis=1))
-    observations = _observations(model, cameras, image_ids, xyz)
+    observations = _observations(model, cameras, image_ids, tracks)
     observations = observations.where(~far_point[observations.point])
     in_front: BoolArray = observations.depth > 0
     inside = _inside_image(model, cameras, image_ids, observations)
@@ -135,7 +136,7 @@ def select_for_training(
     return Selection(
         image_ids=tuple(int(i) for i in image_ids[observes]),
         xyz=xyz[usable_point],
-        rgb=rgb[usable_point],
+        rgb=tracks.rgb[usable_point],
         observations=replace(
             observations,
             point=_renumbered(usable_point)[observations.point],
@@ -159,19 +160,19 @@ def _no_points_message(model: pycolmap.Reconstruction) -> str:
 
 # ------------------------------------------------------------------------- observations
 def _observations(
-    model: pycolmap.Reconstruction, cameras: Mapping[int, CentredPinhole], image_ids: IntArray, xyz: FloatArray
+    model: pycolmap.Reconstruction,
+    cameras: Mapping[int, CentredPinhole],
+    image_ids: IntArray,
+    tracks: SparseObservations,
 ) -> Observations:
     """All observations of the images."""
-    row_of = {point_id: row for row, point_id in enumerate(model.points3D)}
     rows, xy_pinhole, depths = [np.empty(0, np.int64)], [np.empty((0, 2))], [np.empty(0)]
     for image in (model.image(int(i)) for i in image_ids):
-        found = [(row_of[p.point3D_id], *p.xy) for p in image.get_observation_points2D()]
-        table = np.array(found, dtype=np.float64).reshape(-1, 3)
-        points = table[:, 0].astype(np.int64)
+        points = tracks.points[image.image_id]
         cam_from_world = image.cam_from_world().matrix()
         rows.append(points)
-        xy_pinhole.append(cameras[image.camera_id].xy_pinhole(table[:, 1:]))
-        depths.append(xyz[points] @ cam_from_world[2, :3] + cam_from_world[2, 3])
+        xy_pinhole.append(cameras[image.camera_id].xy_pinhole(tracks.xy[image.image_id]))
+        depths.append(tracks.xyz[points] @ cam_from_world[2, :3] + cam_from_world[2, 3])
     images = np.repeat(np.arange(len(image_ids)), [len(points) for points in rows[1:]])
     return Observations(
         point=np.concatenate(rows), image=images, xy=np.concatenate(xy_pinhole), depth=np.concatenate(depths)

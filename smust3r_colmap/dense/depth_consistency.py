@@ -22,9 +22,10 @@ import numpy.typing as npt
 import pycolmap
 from scipy import sparse
 
+from smust3r_colmap.colmap.reconstruction import SparseObservations
 from smust3r_colmap.errors import InputError
 from smust3r_colmap.estimators.robust import weighted_median
-from smust3r_colmap.geometry.arrays import FloatArray, IntArray
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.geometry.depth_noise import ADJACENT_PIXELS, VIEW_AGREEMENT
 from smust3r_colmap.products import DepthMaps
@@ -95,7 +96,7 @@ def depth_of_model(
         InputError: an undistorted image is not in the original model, or its camera is no pinhole.
     """
     names = _names_with_maps(original, undistorted, maps)
-    observations = _Observations.of(original, names)
+    observations = SparseObservations.of(original, names)
     scales = _scales(original, names, observations, maps)
     views = {i: _View.of(undistorted, i) for i in names}
     warped = _warped_maps(original, undistorted, maps, scales)
@@ -106,7 +107,7 @@ def depth_of_model(
 def depth_scales(model: pycolmap.Reconstruction, maps: DepthMaps) -> dict[int, float]:
     """By image id, what the depth map of each image of the model must be multiplied with to fit its points."""
     names = {i: model.image(i).name for i in sorted(model.reg_image_ids()) if model.image(i).name in maps}
-    return {i: scale.factor for i, scale in _scales(model, names, _Observations.of(model, names), maps).items()}
+    return {i: scale.factor for i, scale in _scales(model, names, SparseObservations.of(model, names), maps).items()}
 
 
 def _iterate(
@@ -269,36 +270,6 @@ def _with_bounded_memory(warp: Callable[[int], _DepthLookup]) -> Callable[[int],
 
 
 # ------------------------------------------------------------------------------- scale
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Observations:
-    """Which sparse points the images observe, and where.
-
-    Args:
-        xyz: (P, 3) in the world. track_lengths: (P,).
-        points: by image id, (n,) rows of ``xyz``. xy: by image id, (n, 2) in the original image.
-    """
-
-    xyz: FloatArray
-    track_lengths: FloatArray
-    points: dict[int, IntArray]
-    xy: dict[int, FloatArray]
-
-    @classmethod
-    def of(cls, model: pycolmap.Reconstruction, images: Mapping[int, str]) -> _Observations:
-        row_of = {point_id: row for row, point_id in enumerate(model.points3D)}
-        points, xy = {}, {}
-        for i in images:
-            observed = [(row_of[p.point3D_id], *p.xy) for p in model.image(i).get_observation_points2D()]
-            table = np.array(observed, dtype=np.float64).reshape(-1, 3)
-            points[i], xy[i] = table[:, 0].astype(np.int64), table[:, 1:]
-        return cls(
-            xyz=np.array([p.xyz for p in model.points3D.values()], dtype=np.float64).reshape(-1, 3),
-            track_lengths=np.array([p.track.length() for p in model.points3D.values()], dtype=np.float64),
-            points=points,
-            xy=xy,
-        )
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Scale:
     """Factor from a map's unit to the model's, and the sparse points it rests on."""
@@ -308,7 +279,7 @@ class _Scale:
 
 
 def _scales(
-    model: pycolmap.Reconstruction, images: Mapping[int, str], observations: _Observations, maps: DepthMaps
+    model: pycolmap.Reconstruction, images: Mapping[int, str], observations: SparseObservations, maps: DepthMaps
 ) -> dict[int, _Scale]:
     """One factor per image: the weighted median of z over map depth at the points it observes.
 
@@ -407,7 +378,7 @@ def _confirmed(depth: FloatMap, view: _View, others: Sequence[tuple[_View, _Dept
     return kept
 
 
-def _neighbours(observations: _Observations, views: Mapping[int, _View]) -> dict[int, list[int]]:
+def _neighbours(observations: SparseObservations, views: Mapping[int, _View]) -> dict[int, list[int]]:
     """By image id, at most ``CHECK_NEIGHBOURS`` others with most points in common, seen from elsewhere.
 
     Images that share points with fewer take the nearest cameras that look the same way as well.
@@ -432,7 +403,7 @@ def _neighbours(observations: _Observations, views: Mapping[int, _View]) -> dict
     return chosen
 
 
-def _shared_points(observations: _Observations, ids: Sequence[int]) -> sparse.csr_matrix:
+def _shared_points(observations: SparseObservations, ids: Sequence[int]) -> sparse.csr_matrix:
     """(N, N) number of sparse points that two images both observe."""
     rows = np.concatenate([np.full(len(observations.points[i]), k) for k, i in enumerate(ids)] or [np.empty(0, int)])
     columns = np.concatenate([observations.points[i] for i in ids] or [np.empty(0, int)])
@@ -442,7 +413,7 @@ def _shared_points(observations: _Observations, ids: Sequence[int]) -> sparse.cs
 
 
 def _parallax_weights(
-    observations: _Observations, ids: Sequence[int], centres: FloatArray, k: int, candidates: npt.NDArray[np.intp]
+    observations: SparseObservations, ids: Sequence[int], centres: FloatArray, k: int, candidates: npt.NDArray[np.intp]
 ) -> FloatArray:
     """(C,) from 0 to 1 by the median angle between the rays from two centres to the points that both see."""
     seen_here = np.zeros(len(observations.xyz), np.bool_)

@@ -20,8 +20,6 @@ from smust3r_colmap.colmap.database import open_database
 from smust3r_colmap.features.correspondences import Correspondences
 from smust3r_colmap.geometry.arrays import FloatArray, Pair
 from smust3r_colmap.geometry.camera import Intrinsics
-from smust3r_colmap.geometry.sim3 import invert_rigid
-from smust3r_colmap.geometry.so3 import skew
 
 MIN_INLIER_FRACTION = 0.4
 """Of a pair's verified matches, that must agree with the geometry; of look-alike places few do by chance."""
@@ -153,12 +151,12 @@ class _ImageRays:
 
     Args:
         cam_from_world: (3, 4).
-        rays: (K, 3) of its keypoints at depth 1.
+        xy: (K, 2) of its keypoints at depth 1.
         longer_side: of the image, in focal lengths.
     """
 
     cam_from_world: FloatArray
-    rays: FloatArray
+    xy: FloatArray
     longer_side: float
 
     @classmethod
@@ -166,7 +164,7 @@ class _ImageRays:
         intrinsics = view.intrinsics
         return cls(
             cam_from_world=view.cam_from_world,
-            rays=intrinsics.rays_cam(keypoints),
+            xy=intrinsics.rays_cam(keypoints)[:, :2],
             longer_side=max(intrinsics.width, intrinsics.height) / intrinsics.focal_px,
         )
 
@@ -174,18 +172,15 @@ class _ImageRays:
 def _on_epipolar_lines(
     a: _ImageRays, b: _ImageRays, matches: npt.NDArray[np.uint32], tolerance: float
 ) -> npt.NDArray[np.bool_]:
-    """(M,) whether the Sampson distance is within the tolerance; without a baseline, any direction of it is assumed."""
-    b_from_world, world_from_a = b.cam_from_world, invert_rigid(a.cam_from_world)
-    rotation = b_from_world[:, :3] @ world_from_a[:, :3]
-    translation = b_from_world[:, :3] @ world_from_a[:, 3] + b_from_world[:, 3]
-    length = np.linalg.norm(translation)
-    direction = translation / length if length > 0 else np.array([1.0, 0.0, 0.0])
-    essential = skew(direction) @ rotation
-    rays_a, rays_b = a.rays[matches[:, 0]], b.rays[matches[:, 1]]
-    line_b, line_a = rays_a @ essential.T, rays_b @ essential
-    residual = np.abs(np.einsum("ij,ij->i", rays_b, line_b))
-    slope = np.sqrt((line_b[:, :2] ** 2).sum(axis=1) + (line_a[:, :2] ** 2).sum(axis=1))
+    """(M,) whether the Sampson distance is within the tolerance; without a baseline, a direction of it is assumed.
+
+    False for NaN rays, where undistortion fails.
+    """
+    b_from_a = pycolmap.Rigid3d(b.cam_from_world) * pycolmap.Rigid3d(a.cam_from_world).inverse()
+    if not b_from_a.translation.any():
+        b_from_a.translation = np.array([1.0, 0.0, 0.0])
+    essential = pycolmap.essential_matrix_from_pose(b_from_a)
+    squared = pycolmap.compute_squared_sampson_error(a.xy[matches[:, 0]], b.xy[matches[:, 1]], essential)
     # The mean, so that the order of the images does not matter: one may be a wide angle, the other a tele lens.
     limit = tolerance * (a.longer_side + b.longer_side) / 2
-    good: npt.NDArray[np.bool_] = residual <= limit * slope  # false for NaN rays, where undistortion fails
-    return good
+    return np.asarray(np.asarray(squared) <= limit**2)

@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap
 from scipy.sparse import csr_array
 
-from smust3r_colmap.colmap.reconstruction import poses_of
+from smust3r_colmap.colmap.reconstruction import SparseObservations, poses_of
 from smust3r_colmap.estimators.similarity import CentredPairs
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import invert_rigid
@@ -195,14 +195,13 @@ def robust_cost(model: pycolmap.Reconstruction) -> float:
     Source: twice Ceres's cost, its ``CauchyLoss`` with a scale of ``LOSS_SCALE_PX``.
     """
     cost = 0.0
-    for image_id in sorted(model.reg_image_ids()):
-        image = model.image(image_id)
-        seen = image.get_observation_points2D()
-        if not seen:
+    observations = SparseObservations.of(model, sorted(model.reg_image_ids()))
+    for image_id, points in observations.points.items():
+        if not len(points):
             continue
-        xyz_world = np.stack([model.point3D(point.point3D_id).xyz for point in seen])
-        projected = model.camera(image.camera_id).img_from_cam(image.cam_from_world() * xyz_world)
-        errors = np.linalg.norm(np.asarray(projected) - np.stack([point.xy for point in seen]), axis=1)
+        image = model.image(image_id)
+        projected = model.camera(image.camera_id).img_from_cam(image.cam_from_world() * observations.xyz[points])
+        errors = np.linalg.norm(np.asarray(projected) - observations.xy[image_id], axis=1)
         cost += float(np.nansum(np.log1p((errors / LOSS_SCALE_PX) ** 2))) * LOSS_SCALE_PX**2
     return cost
 

@@ -24,7 +24,7 @@ import pycolmap
 
 from smust3r_colmap.colmap.database import write_colmap_database
 from smust3r_colmap.colmap.model_files import write_binary_checked
-from smust3r_colmap.colmap.reconstruction import cameras_of, poses_of
+from smust3r_colmap.colmap.reconstruction import SparseObservations, cameras_of, poses_of
 from smust3r_colmap.errors import ImageError
 from smust3r_colmap.features.correspondences import Correspondences, joined
 from smust3r_colmap.features.guided_verification import (
@@ -337,29 +337,23 @@ def _extract_colors(model: pycolmap.Reconstruction, collection: ImageCollection)
 
     Read by our own reader, because pycolmap's ``extract_colors_for_all_images`` ignores the orientation in EXIF.
     """
-    point_ids: list[int] = []
-    colours: list[FloatArray] = []
-    for image_id in sorted(model.reg_image_ids()):
-        seen = model.image(image_id).get_observation_points2D()
-        if not seen:
+    observations = SparseObservations.of(model, sorted(model.reg_image_ids()))
+    sums, counts = np.zeros((len(observations.xyz), 3)), np.zeros(len(observations.xyz))
+    for image_id, points in observations.points.items():
+        if not len(points):
             continue
         try:
             rgb = load_rgb(collection.images[image_id - 1])
         except ImageError as error:
             logger.warning("its points are coloured by other images: %s", error)
             continue
-        xy = np.stack([point.xy for point in seen])
-        column = np.clip(xy[:, 0].astype(np.int64), 0, rgb.shape[1] - 1)
-        row = np.clip(xy[:, 1].astype(np.int64), 0, rgb.shape[0] - 1)
-        colours.append(rgb[row, column].astype(np.float64))
-        point_ids += [point.point3D_id for point in seen]
-    if not colours:
-        return
-    ids, rows, counts = np.unique(point_ids, return_inverse=True, return_counts=True)
-    sums = np.zeros((len(ids), 3))
-    np.add.at(sums, rows, np.concatenate(colours))
-    for point_id, colour in zip(ids.tolist(), np.round(sums / counts[:, None]).astype(np.uint8), strict=True):
-        model.point3D(point_id).color = colour
+        column, row = np.clip(observations.xy[image_id].astype(np.int64), 0, (rgb.shape[1] - 1, rgb.shape[0] - 1)).T
+        np.add.at(sums, points, rgb[row, column])
+        np.add.at(counts, points, 1)
+    colours = np.round(sums / np.maximum(counts, 1)[:, None]).astype(np.uint8)
+    for point_id, colour, count in zip(list(model.points3D), colours, counts, strict=True):
+        if count:
+            model.point3D(point_id).color = colour
 
 
 # ------------------------------------------------------------------------- helpers

@@ -21,6 +21,7 @@ from helpers.dense_scenes import (
     undistorted,
 )
 
+from smust3r_colmap.colmap.reconstruction import SparseObservations
 from smust3r_colmap.dense import depth_consistency
 from smust3r_colmap.dense.depth_consistency import ModelDepth, depth_of_model, sample_depth
 from smust3r_colmap.errors import InputError
@@ -228,8 +229,9 @@ def test_views_from_the_same_place_are_asked_last(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(depth_consistency, "CHECK_NEIGHBOURS", 2)
     xyz = np.random.default_rng(1).uniform([-1, -1, 4], [1, 1, 6], (50, 3))
     everything = np.arange(50)
-    observations = depth_consistency._Observations(
+    observations = SparseObservations(
         xyz=xyz,
+        rgb=np.zeros((50, 3), np.uint8),
         track_lengths=np.full(50, 4.0),
         points=dict.fromkeys((1, 2, 3, 4), everything) | {4: everything[:30]},
         xy={},
