@@ -21,6 +21,7 @@ import pycolmap
 from smust3r_colmap.config import CameraConfig
 from smust3r_colmap.errors import ConfigError, InputError
 from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.geometry.world_frame import WorldFrame
 from smust3r_colmap.importers.colmap_model import MIN_IMAGES, ExternalModel, SurfacePoints
 from smust3r_colmap.importers.image_folder import FolderScan, natural_key, shared_prior
 from smust3r_colmap.importers.images import Photo
@@ -98,7 +99,7 @@ class FittedModel:
             cameras=dict(enumerate(self.collection.cameras)),
             cam_from_world=self.cam_from_world,
             points=self.surface.cloud,
-            metric=False,
+            frame=WorldFrame(metric=False),
             segments=(origin,),
         )
 

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.transform import Transform
+from smust3r_colmap.geometry.world_frame import WorldFrame
 
 
 # ----------------------------------------------------------------------------- import
@@ -382,7 +383,7 @@ class Scene:
         cameras: intrinsics by camera index, at the original image size.
         cam_from_world: (N, 3, 4) rigid.
         points: the fused cloud, in the world frame.
-        metric: lengths are metres.
+        frame: what the coordinates mean outside of the scene.
         segments: names of the submodels that were stitched, the first being the world frame.
     """
 
@@ -392,7 +393,7 @@ class Scene:
     cameras: dict[int, Intrinsics]
     cam_from_world: FloatArray
     points: PointCloud
-    metric: bool
+    frame: WorldFrame
     segments: tuple[str, ...]
 
     def __post_init__(self) -> None:
@@ -407,6 +408,11 @@ class Scene:
 
     def __len__(self) -> int:
         return len(self.image_indices)
+
+    @property
+    def metric(self) -> bool:
+        """Lengths are metres."""
+        return self.frame.metric
 
 
 class DepthMaps(Protocol):

@@ -14,6 +14,7 @@ from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.geometry.so3 import angles_between, nearest_rotation
+from smust3r_colmap.geometry.world_frame import WorldFrame
 from smust3r_colmap.products import DenseMaps, ImageCollection, PointCloud, Scene
 from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.stitching.resection import PlacedSubmodel
@@ -282,7 +283,7 @@ def build_scene(
     intrinsics: dict[int, Intrinsics],
     points: PointCloud,
     *,
-    metric: bool,
+    frame: WorldFrame,
 ) -> Scene:
     """Put the fused parts together under the names of the collection.
 
@@ -290,7 +291,7 @@ def build_scene(
         collection: all images of the run.
         submodels: of this connected part; the first is the world frame. Submodels of loops are named too.
         cameras, intrinsics, points: their fused cameras, calibrations and cloud.
-        metric: lengths are metres.
+        frame: of the scene.
     """
     images = [collection.images[image] for image in cameras.images]
     return Scene(
@@ -300,6 +301,6 @@ def build_scene(
         cameras=intrinsics,
         cam_from_world=cameras.cam_from_world,
         points=points,
-        metric=metric,
+        frame=frame,
         segments=tuple(placed.submodel.name for placed in submodels),
     )

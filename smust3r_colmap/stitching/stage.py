@@ -18,6 +18,7 @@ from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.geometry.groups import GROUPS
+from smust3r_colmap.geometry.world_frame import WorldFrame
 from smust3r_colmap.products import EMPTY_CLOUD, DenseMaps, Edges, ImageCollection, Scene
 from smust3r_colmap.segmentation.loop_segments import LoopPlan
 from smust3r_colmap.segmentation.stage import Segments
@@ -264,7 +265,7 @@ def _scene(
     if collection.calibrated:
         intrinsics = {camera: collection.cameras[camera] for camera in intrinsics}
     metric = all(result.reconstructions[one.submodel.segment].metric for one in placed)
-    return build_scene(collection, placed, cameras, intrinsics, EMPTY_CLOUD, metric=metric)
+    return build_scene(collection, placed, cameras, intrinsics, EMPTY_CLOUD, frame=WorldFrame(metric=metric))
 
 
 def _inputs_of(part: ChainedPart, result: BackboneResult, collection: ImageCollection) -> list[tuple[object, ...]]:

@@ -56,7 +56,7 @@ IMPORT_STAGE, STITCHED_STAGE, REFINED_STAGE, SCENE_STAGE = "import", "stitched",
 MODEL_FOLDER, DATABASE_FILE = "model", "database.db"
 """Of the refinement: the model of each scene, and the database that goes with all of them."""
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """Part of every key; a change of what a stage stores or computes raises it."""
 
 _LOCK_WAIT_S = 3.0

@@ -28,6 +28,7 @@ from smust3r_colmap.features.pairs import alike_pairs, neighbouring_pairs
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import pointmap_from_depth
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
+from smust3r_colmap.geometry.world_frame import WorldFrame
 from smust3r_colmap.products import EMPTY_CLOUD, Scene
 from smust3r_colmap.refine_model import refine_model
 from smust3r_colmap.report.summary import RunSummary
@@ -386,7 +387,7 @@ def scene_of(world_from_cam: FloatArray) -> Scene:
         cameras={0: CAMERA},
         cam_from_world=invert_rigid(world_from_cam),
         points=EMPTY_CLOUD,
-        metric=False,
+        frame=WorldFrame(metric=False),
         segments=("0",),
     )
 

@@ -26,6 +26,7 @@ from smust3r_colmap.exporters.ply import write_ply
 from smust3r_colmap.exporters.tum_trajectory import write_tum
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.geometry.world_frame import WorldFrame
 from smust3r_colmap.products import PointCloud, Scene
 
 NAMES = ("a.jpg", "left/b.jpg", "left/ü.jpg", "right/c.png")
@@ -58,7 +59,7 @@ def scene(names: tuple[str, ...] = NAMES, *, num_points: int = 50) -> Scene:
         },
         cam_from_world=poses,
         points=cloud(num_points),
-        metric=False,
+        frame=WorldFrame(metric=False),
         segments=("0", "1"),
     )
 

@@ -17,6 +17,7 @@ from smust3r_colmap.colmap.database import write_images
 from smust3r_colmap.geometry.arrays import FloatArray, IntArray, Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.geometry.world_frame import WorldFrame
 from smust3r_colmap.products import EMPTY_CLOUD, ImageCollection, Scene, SourceImage
 
 CAMERA = Intrinsics(model="SIMPLE_RADIAL", width=640, height=480, params=(560.0, 320.0, 240.0, -0.04))
@@ -271,7 +272,7 @@ def stitched_scene(
         cameras=dict(cameras or enumerate(collection.cameras)),
         cam_from_world=cam_from_world[list(indices)],
         points=EMPTY_CLOUD,
-        metric=True,
+        frame=WorldFrame(metric=True),
         segments=("0",),
     )
 

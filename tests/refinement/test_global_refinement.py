@@ -46,6 +46,7 @@ from smust3r_colmap.features import stage as features_stage
 from smust3r_colmap.features.seen_surfaces import GRID_CELLS, surfaces_of_clouds
 from smust3r_colmap.geometry.arrays import FloatArray, Pair
 from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.geometry.world_frame import WorldFrame
 from smust3r_colmap.products import ImageCollection, PointCloud, RunFeatures, Scene
 from smust3r_colmap.refinement import bundle_adjustment, mapper, statistics
 from smust3r_colmap.refinement import stage as refine
@@ -811,7 +812,7 @@ def test_surface_of_an_image_is_the_nearest_of_the_cloud_in_every_cell() -> None
         cameras={0: CAMERA},
         cam_from_world=world.cam_from_world,
         points=cloud,
-        metric=True,
+        frame=WorldFrame(metric=True),
         segments=("0",),
     )
     surfaces = surfaces_of_clouds([collection_of])

@@ -21,6 +21,7 @@ from smust3r_colmap.exporters.colmap_sparse import write_colmap_sparse
 from smust3r_colmap.exporters.tum_trajectory import write_tum
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.geometry.world_frame import WorldFrame
 from smust3r_colmap.products import EMPTY_CLOUD, Scene
 from smust3r_colmap.synthetic.settings import PRESETS, REFERENCE_LENGTH
 from smust3r_colmap.synthetic.truth import TrueScene
@@ -209,7 +210,7 @@ def a_scene(num_images: int) -> Scene:
         cameras={0: camera},
         cam_from_world=invert_rigid(world_from_cam),
         points=EMPTY_CLOUD,
-        metric=False,
+        frame=WorldFrame(metric=False),
         segments=("0",),
     )
 

@@ -35,6 +35,7 @@ from smust3r_colmap.exporters.tum_trajectory import write_tum
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.geometry.world_frame import WorldFrame
 from smust3r_colmap.products import EMPTY_CLOUD, Scene
 
 NUM_IMAGES = 20
@@ -341,7 +342,7 @@ def write_path(path: Path, trajectory: Mapping[str, FloatArray]) -> None:
         cam_from_world=invert_rigid(np.array(list(trajectory.values()))),
         cameras={0: Intrinsics(model="SIMPLE_PINHOLE", width=64, height=48, params=(60.0, 32.0, 24.0))},
         points=EMPTY_CLOUD,
-        metric=False,
+        frame=WorldFrame(metric=False),
         segments=("0",),
     )
     write_tum(scene, path, None)

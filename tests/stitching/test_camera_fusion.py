@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.geometry.world_frame import WorldFrame
 from smust3r_colmap.products import ImageCollection, SourceImage, Submodel
 from smust3r_colmap.stitching.camera_fusion import build_scene, fuse_cameras, fuse_intrinsics, support_weights
 
@@ -253,7 +254,7 @@ def test_scene_holds_the_fused_parts_under_the_names_of_the_collection() -> None
     cameras = world.cameras()
     intrinsics = fuse_intrinsics(world.placed(), [image.camera for image in images])
     points = world.points(max_points=100).cloud
-    scene = build_scene(collection, world.placed(), cameras, intrinsics, points, metric=True)
+    scene = build_scene(collection, world.placed(), cameras, intrinsics, points, frame=WorldFrame(metric=True))
     assert scene.image_indices == tuple(range(3, 12))
     assert scene.image_names == tuple(f"{i:02}.jpg" for i in range(3, 12))
     assert scene.camera_indices == tuple(i % 2 for i in range(3, 12))
