@@ -131,7 +131,7 @@ def open_finished(run: RunDirectory, *, images: Path | None = None, output: Path
     """What the run has stored.
 
     Args:
-        run: held by this process, so that nobody changes it meanwhile; see ``check_is_finished``.
+        run: locked by this process; see ``check_is_finished``.
         images: the folder of the images, where it has moved since.
         output: where results go instead of the run's folder.
 

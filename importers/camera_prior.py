@@ -21,7 +21,7 @@ from PIL.TiffImagePlugin import IFDRational
 from smust3r_colmap.errors import StorageError
 
 DEFAULT_FOCAL_RATIO = 1.2
-"""Focal length by longer side of a camera nobody knows; COLMAP's default."""
+"""Focal length by longer side of an unknown camera; COLMAP's default."""
 
 PLAUSIBLE_FOCAL_RATIO = (0.1, 10.0)
 """Focal length by longer side beyond which a tag is taken for a mistake; COLMAP's own bounds."""

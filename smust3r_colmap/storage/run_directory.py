@@ -24,7 +24,7 @@
         scene/             the adjusted cameras and fused clouds, before they are exported
         finished.json      when all stages stand: which of them belong together, and where the images are
 
-A stage is a folder. It is written aside (``NAME.partial``) and renamed, with a ``stage.json`` that
+A stage is a folder. It is written as ``NAME.partial`` and renamed, with a ``stage.json`` that
 holds the key: a hash of its inputs and settings. A folder whose key is as expected is finished and
 is read; any other is made again. What failed is not stored under the key of what was wanted, so the
 next start tries it again. Arrays are safetensors, facts are JSON, nothing is pickled.
@@ -179,14 +179,14 @@ class StageFolder:
         It may be called in a child process. The name carries the process id, so that a child that
         outlives a killed parent by a moment cannot touch what the next run writes.
         """
-        aside = self.path.with_name(f"{self.path.name}.partial-{os.getpid()}")
+        partial = self.path.with_name(f"{self.path.name}.partial-{os.getpid()}")
         with storage_errors(self.path):
-            _remove(aside)
-            aside.mkdir(parents=True)
-            yield aside
-            (aside / _STAGE_FILE).write_text(_json({"key": self.key}), encoding="utf-8")
+            _remove(partial)
+            partial.mkdir(parents=True)
+            yield partial
+            (partial / _STAGE_FILE).write_text(_json({"key": self.key}), encoding="utf-8")
             _remove(self.path)
-            os.replace(aside, self.path)
+            os.replace(partial, self.path)
 
     def open_in_place(self) -> Path:
         """For a store with transactions of its own: the folder, emptied if its key is another's."""

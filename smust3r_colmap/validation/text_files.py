@@ -1,7 +1,7 @@
 """COLMAP's text files as arrays; a line that is not as it should be is named, the rest is read.
 
-COLMAP's own reader stops at the first such line and says which of its checks failed. Other people's
-files break in a few ways again and again: the empty line of an image without observations is left out,
+COLMAP's own reader stops at the first such line and says which of its checks failed. Files of
+other programs often have the same few defects: the empty line of an image without observations is left out,
 so that every second line is taken for what it is not; names hold blanks; lines are cut short.
 The next module to read is ``surroundings``.
 """

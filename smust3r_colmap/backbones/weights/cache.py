@@ -74,7 +74,7 @@ def find_weights(given: str | None, network_size: int) -> Path:
 
 
 def named_file(named: str, *, said_by: str, kind: Kind) -> Path:
-    """The file that somebody named, by its path or, if it is in the cache, by its official name.
+    """The file at a path, or the file of an official name in the cache.
 
     Args:
         named: path or official name; a file of that path comes first.
