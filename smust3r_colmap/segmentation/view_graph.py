@@ -1,7 +1,8 @@
 """Which images may see the same place: pairs of images, each with a weight and a reason.
 
-A sequence gives the pairs of consecutive images; retrieval, and the user, add others. Whoever asks which images are
-neighbours, or how far apart they are in order, asks here, so no other module compares image indices.
+A sequence gives the pairs of consecutive images; retrieval, and the user, add others. Segmentation, backbones,
+alignment and stitching ask here which images are neighbours, or how far apart they are in order. Refinement compares
+image indices itself, for pairs that no backbone matched and for poses that are put back.
 The next module to read is ``windows``.
 """
 
