@@ -16,7 +16,7 @@ from smust3r_colmap.report.summary import EXIT_DEGRADED
 
 # Position error of the demo, in percent of the path's extent, above which something is broken; a
 # tenth of a percent is usual.
-_DEMO_WEAK_PERCENT = 5.0
+_DEMO_MAX_PERCENT = 5.0
 # The demo's walls are covered with texture; a quarter of the features does, in a third of the time.
 _DEMO_SETTINGS = RunConfig(
     features=FeatureConfig(max_features=1500),
@@ -66,7 +66,7 @@ def _demo(command: Demo, reporter: Reporter) -> int:
     model = result / summary.models[0].folder
     distance = compare_trajectories(read_reference_sparse(model), truth)
     print(f"Cameras of {model} against the truth in {truth_file}:\n  {distance.render_text('m')}")
-    if distance.position_rmse_percent > _DEMO_WEAK_PERCENT:
-        reporter.warn(f"that is more than {_DEMO_WEAK_PERCENT:.0f} %: the result is wrong")
+    if distance.position_rmse_percent > _DEMO_MAX_PERCENT:
+        reporter.warn(f"that is more than {_DEMO_MAX_PERCENT:.0f} %: the result is wrong")
         return EXIT_DEGRADED
     return summary.exit_code

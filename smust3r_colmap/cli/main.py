@@ -68,8 +68,8 @@ def parse(arguments: Sequence[str]) -> Command:
     """
     if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
         near = difflib.get_close_matches(arguments[0], COMMANDS, n=1)
-        meant = f"; did you mean {near[0]}?" if near else ""
-        raise ConfigError(f"there is no command {arguments[0]!r}{meant} The commands are {', '.join(COMMANDS)}")
+        meant = f" (did you mean {near[0]}?)" if near else ""
+        raise ConfigError(f"there is no command {arguments[0]!r}{meant}; the commands are {', '.join(COMMANDS)}")
     command: Command = tyro.cli(
         Command,
         prog="smust3r-colmap",

@@ -24,8 +24,8 @@ class Reconstruct:
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None
     """Settings, such as segment_length = 40; flags override them. OUT/config.toml of a run can be given back."""
     preset: Preset = "default"
-    """Settings that go together, for speed (fast) or for most images and detail (thorough); the file after --config
-    and flags override them."""
+    """Settings that go together, for speed (fast) or for as many images as possible (thorough); the file after
+    --config and flags override them."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Throw away what an earlier run left in OUT."""
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False

@@ -162,7 +162,7 @@ class RunSummary:
 
     @property
     def exit_code(self) -> int:
-        """For the shell: good, or finished but weak."""
+        """For the shell: good, or finished with warnings."""
         return EXIT_DEGRADED if self.weak_reasons else EXIT_GOOD
 
     def to_json_dict(self) -> dict[str, Any]:

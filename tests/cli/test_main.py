@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -21,7 +22,20 @@ from smust3r_colmap.alignment.stage import EdgeSummary
 from smust3r_colmap.backbones.registry import list_backbones
 from smust3r_colmap.cli import doctor
 from smust3r_colmap.cli import main as cli
-from smust3r_colmap.config import RunConfig
+from smust3r_colmap.cli.fields import field_docs
+from smust3r_colmap.cli.presets import PRESETS
+from smust3r_colmap.cli.reconstruct import Reconstruct
+from smust3r_colmap.cli.refine import Refine
+from smust3r_colmap.config import (
+    ClassicalConfig,
+    FeatureConfig,
+    LoopConfig,
+    ModelOutputConfig,
+    Must3rConfig,
+    OutputConfig,
+    RefinementConfig,
+    RunConfig,
+)
 from smust3r_colmap.errors import CollectionError, ReconstructionError, advice_for
 from smust3r_colmap.evaluation.readers import read_poses_txt
 from smust3r_colmap.execution.progress import (
@@ -80,6 +94,8 @@ def _raise(error: BaseException) -> Pipeline:
     return reconstruct
 
 
+WIDTH, MIN_TEXT_COLUMN = 100, 10
+WEIGHTS_ACTIONS = ("list", "fetch", "verify", "convert", "path")
 RECONSTRUCT = ["reconstruct", "photos", "--output", "out"]
 
 
@@ -168,6 +184,37 @@ def test_bad_flags_exit_2(put_pipeline: PutPipeline, argv: list[str]) -> None:
     with pytest.raises(SystemExit) as leaving:
         cli.main(argv)
     assert leaving.value.code == 2
+
+
+@pytest.mark.parametrize(("typed", "meant"), [("reconstrct", " (did you mean reconstruct?)"), ("frobnicate", "")])
+def test_an_unknown_command_exits_2_with_those_there_are(
+    capsys: pytest.CaptureFixture[str], typed: str, meant: str
+) -> None:
+    assert cli.main([typed, "photos"]) == 2
+    assert capsys.readouterr().err == (
+        f"smust3r-colmap: there is no command {typed!r}{meant}; "
+        "the commands are reconstruct, refine, export, validate, demo, doctor, weights\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("flag", "value"),
+    [
+        ("--segment-length", "many"),
+        ("--camera-mode", "none"),
+        ("--workers", "several"),
+        ("--loop-similarity", "high"),
+        ("--network-memory", "all"),
+        ("--trainer-scales", "2,x"),
+        ("--preset", "slow"),
+    ],
+)
+def test_a_bad_value_is_named_with_its_flag(capsys: pytest.CaptureFixture[str], flag: str, value: str) -> None:
+    with pytest.raises(SystemExit) as leaving:
+        cli.main([*RECONSTRUCT, flag, value])
+    said = capsys.readouterr().err
+    assert leaving.value.code == 2
+    assert flag in said and value.rsplit(",", maxsplit=1)[-1] in said
 
 
 @pytest.mark.parametrize("overlap", ["60", "61", "0"])
@@ -273,6 +320,89 @@ def test_flags_override_the_file_and_the_file_the_defaults(put_pipeline: PutPipe
     assert call.config.classical == RunConfig().classical
 
 
+def settings_of(*words: str) -> RunConfig:
+    command = cli.parse([*RECONSTRUCT, *words])
+    assert isinstance(command, Reconstruct)
+    return command.settings
+
+
+def test_the_default_preset_changes_nothing() -> None:
+    assert settings_of() == settings_of("--preset", "default") == RunConfig()
+
+
+@pytest.mark.parametrize("name", ["fast", "thorough"])
+def test_a_preset_is_a_set_of_settings_that_differ_from_the_defaults(tmp_path: Path, name: str) -> None:
+    lines = [f"{key} = {json.dumps(value)}" for key, value in PRESETS[name].items()]
+    (tmp_path / "s.toml").write_text("\n".join(lines), encoding="utf-8")
+    chosen = settings_of("--preset", name)
+    assert chosen == settings_of("--config", str(tmp_path / "s.toml")) != RunConfig()
+    assert settings_of(f"--preset={name}") == chosen
+    for key in PRESETS[name]:
+        others = [line for line in lines if not line.startswith(f"{key} =")]
+        (tmp_path / "s.toml").write_text("\n".join(others), encoding="utf-8")
+        assert settings_of("--config", str(tmp_path / "s.toml")) != chosen, f"{key} is the default"
+
+
+def test_the_file_overrides_the_preset_and_flags_the_file(tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text("max_features = 3000\nmatch_neighbours = 4\n", encoding="utf-8")
+    config = settings_of("--match-neighbours", "6", "--config", str(tmp_path / "s.toml"), "--preset", "fast")
+    assert config.features == FeatureConfig(max_features=3000)
+    assert config.classical == ClassicalConfig(match_neighbours=6)
+    assert not config.output.dense
+
+
+def test_what_is_not_given_is_none_or_auto() -> None:
+    config = settings_of()
+    assert (config.masks, config.backbone_options, config.cameras.camera_params) == (None, None, None)
+    assert (config.must3r.weights, config.must3r.retrieval_weights, config.output.trainer_scales) == (None, None, None)
+    assert (config.workers, config.loop_closing.loop_similarity, config.must3r.network_memory) == ("auto",) * 3
+
+
+def test_none_and_auto_take_back_what_the_file_gives(tmp_path: Path) -> None:
+    text = "masks = 'm'\nworkers = 3\ncamera_params = '1,2'\ntrainer_scales = [2]\nloop_similarity = 0.9\n"
+    (tmp_path / "s.toml").write_text(text, encoding="utf-8")
+    from_file = settings_of("--config", str(tmp_path / "s.toml"))
+    assert (from_file.masks, from_file.workers, from_file.cameras.camera_params) == (Path("m"), 3, "1,2")
+    words = "--masks None --workers auto --camera-params None --trainer-scales None --loop-similarity auto"
+    assert settings_of("--config", str(tmp_path / "s.toml"), *words.split()) == RunConfig()
+
+
+@pytest.mark.parametrize("words", [["2,4,8"], ["2", "4", "8"], ["2,4", "8"]])
+def test_scales_are_given_with_commas_or_blanks(words: list[str]) -> None:
+    assert settings_of("--trainer-scales", *words).output.trainer_scales == (2, 4, 8)
+
+
+@pytest.mark.parametrize("command", [RECONSTRUCT, ["refine", "model", "--images", "photos"]])
+def test_the_same_switches_have_the_same_spelling_and_default(command: list[str]) -> None:
+    def output_of(*words: str) -> ModelOutputConfig:
+        parsed = cli.parse([*command, *words])
+        assert isinstance(parsed, Reconstruct | Refine)
+        return parsed.settings.output
+
+    assert output_of().trainer
+    assert not output_of("--no-trainer").trainer
+    assert output_of("--no-trainer", "--trainer", "--no-text").trainer
+    for gone in ("--fresh", "--complete", "--no-loops", "--tracks=features", "--loop-half-width=3"):
+        with pytest.raises(SystemExit):
+            output_of(gone)
+
+
+@pytest.mark.parametrize(
+    ("words", "changed"),
+    [
+        ("--no-loop-closure", {"loop_closing": LoopConfig(loop_closure=False)}),
+        ("--loop-window 3", {"loop_closing": LoopConfig(loop_window=3)}),
+        ("--register-missing", {"refinement": RefinementConfig(register_missing=True)}),
+        ("--track-source both", {"refinement": RefinementConfig(track_source="both")}),
+        ("--masks m", {"masks": Path("m")}),
+        ("--workers 2", {"workers": 2}),
+        ("--network-memory 1.5", {"must3r": Must3rConfig(network_memory=1.5)}),
+    ],
+)
+def test_flags_reach_their_setting(words: str, changed: dict[str, Any]) -> None:
+    assert settings_of(*words.split()) == replace(RunConfig(), **changed)
+
+
 def test_unknown_key_of_the_file_exits_2(
     put_pipeline: PutPipeline, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -294,6 +424,47 @@ def test_help_names_every_setting_with_its_reason(capsys: pytest.CaptureFixture[
         assert part in text
     assert "Images per segment" in text
     assert "--segmentation" not in text
+
+
+HELP = [[], *([name] for name in cli.COMMANDS), *(["weights", name] for name in WEIGHTS_ACTIONS)]
+
+
+def help_of(words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
+    monkeypatch.setenv("COLUMNS", str(WIDTH))
+    with pytest.raises(SystemExit) as leaving:
+        cli.main([*words, "--help"])
+    assert leaving.value.code == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", HELP, ids=" ".join)
+def test_no_line_of_help_is_broken_by_the_source(
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In the column of texts, a line ends where the next word does not fit any more."""
+    lines = [line.rstrip("│ ") for line in help_of(words, monkeypatch, capsys).splitlines()]
+    for line, following in pairwise(lines):
+        start = len(following) - len(following.lstrip("│ "))
+        if start >= MIN_TEXT_COLUMN and re.fullmatch(r"  [^ ].*", line[start - 2 :]):
+            assert len(line) + 1 + len(following.lstrip("│ ").split()[0]) > WIDTH - 4, f"broken after: {line}"
+
+
+@pytest.mark.parametrize("name", ["reconstruct", "refine"])
+def test_what_most_people_need_comes_first(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = help_of([name], monkeypatch, capsys)
+    flags = re.findall(r"^\W* (--[a-z][a-z0-9-]*)", text, re.M)
+    titles = re.findall(r"^\W* ((?:[a-z0-9-]+ )?(?:arguments|options)) ", text, re.M)
+    assert titles[:4] == ["positional arguments", "options", "cameras options", "output options"]
+    general = {"--output", "--config", "--overwrite", "--workers", "--masks", "--camera-model", "--trainer"}
+    assert general <= set(flags[: flags.index("--max-image-size")])
+
+
+def test_the_docstrings_of_inherited_fields_are_found() -> None:
+    docs = field_docs(OutputConfig)
+    assert docs["text"] == "Write the COLMAP model as .txt beside the .bin files."
+    assert docs.keys() == {"text", "trainer", "trainer_scales", "dense", "mesh"}
 
 
 def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
