@@ -48,7 +48,7 @@ def test_every_question_changes_one_setting_and_has_the_default_among_its_answer
         "lengths": {"segment_length", "overlap"},
         "overlaps": {"overlap"},
         "groups": {"transform_group"},
-        "loops": {"loops", "loop_kernel"},
+        "loops": {"loop_closure", "loop_kernel"},
         "edges": {"alignment_edges"},
         "weighting": {"confidence_weighting", "alignment_source"},
     }
