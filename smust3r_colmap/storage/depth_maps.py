@@ -22,22 +22,23 @@ class DepthMapWriter:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._names: list[str] = []
+        self._number: dict[str, int] = {}
 
     def write(self, name: str, depth: npt.NDArray[np.float32], confidence: npt.NDArray[np.float32]) -> None:
         """Depth (H, W) and confidence (H, W) of an image; the first map of a name counts."""
-        if name in self._names:
+        if name in self._number:
             return
         arrays: dict[str, npt.NDArray[Any]] = {
             "depth": depth.astype(np.float32),
             "confidence": np.minimum(confidence, np.finfo(np.float16).max).astype(np.float16),
         }
-        write_arrays(self._folder / f"{len(self._names):08d}.safetensors", arrays)
-        self._names.append(name)
+        number = len(self._number)
+        write_arrays(self._folder / f"{number:08d}.safetensors", arrays)
+        self._number[name] = number
 
     def finish(self) -> None:
         """Say which file is whose."""
-        write_json(self._folder / _NAMES, self._names)
+        write_json(self._folder / _NAMES, list(self._number))
 
 
 class StoredDepthMaps:

@@ -26,8 +26,7 @@ from smust3r_colmap.backbones.classical.calibration import (
     self_calibration_is_better,
 )
 from smust3r_colmap.backbones.classical.dense import DepthTask, make_depth
-from smust3r_colmap.backbones.classical.mapping import METHOD_VERSION, MappedSegment, map_segment
-from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
+from smust3r_colmap.backbones.classical.mapping import MAPPED_SEGMENT, METHOD_VERSION, MappedSegment, map_segment
 from smust3r_colmap.backbones.classical.strategies import MappingTask
 from smust3r_colmap.backbones.options import NoOptions
 from smust3r_colmap.colmap.database import open_database
@@ -289,9 +288,9 @@ class ClassicalBackbone:
                 logger.warning("segment %d, %s", failed[k].segment, failed[k].attempts[-1])
             else:
                 with folders[k].write() as folder:
-                    write_mapped(folder, result.value)
+                    MAPPED_SEGMENT.write(folder, result.value)
             stage.advance()
-        return [failed[k] if k in failed else read_mapped(folder.path) for k, folder in enumerate(folders)]
+        return [failed[k] if k in failed else MAPPED_SEGMENT.read(folder.path) for k, folder in enumerate(folders)]
 
     def _dense(self, submodels: Sequence[Submodel], with_maps: Collection[int]) -> tuple[tuple[DenseMaps, ...], str]:
         """Maps of every submodel and their common key; a submodel whose sweep failed gets empty ones and a warning."""

@@ -45,6 +45,7 @@ from smust3r_colmap.backbones.classical.strategies import (
 from smust3r_colmap.colmap.database import open_database
 from smust3r_colmap.geometry.arrays import Pair
 from smust3r_colmap.products import UnregisteredImage
+from smust3r_colmap.storage.codec import Codec
 
 ENOUGH_REGISTERED_SHARE = 0.9
 """Share of a segment's images in accepted models at which no further strategy is tried."""
@@ -73,6 +74,9 @@ class MappedSegment:
     models: tuple[MappedModel, ...]
     attempts: tuple[str, ...]
     unregistered: tuple[UnregisteredImage, ...]
+
+
+MAPPED_SEGMENT: Codec[MappedSegment] = Codec(MappedSegment, "segment")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

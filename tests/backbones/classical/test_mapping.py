@@ -11,8 +11,13 @@ import pytest
 from helpers.mapped_segments import NUM_IMAGES, SyntheticSegment, synthetic_segment, without_pairs
 
 from smust3r_colmap.backbones.classical.mapped_model import restrict_model
-from smust3r_colmap.backbones.classical.mapping import MappedSegment, SegmentMapper, choose_models, map_segment
-from smust3r_colmap.backbones.classical.storage import read_mapped, write_mapped
+from smust3r_colmap.backbones.classical.mapping import (
+    MAPPED_SEGMENT,
+    MappedSegment,
+    SegmentMapper,
+    choose_models,
+    map_segment,
+)
 from smust3r_colmap.backbones.classical.strategies import MapperOutput, MappingStrategy, run_strategy
 
 
@@ -62,8 +67,8 @@ def test_a_segment_without_matches_gives_nothing_and_says_so(segment: SyntheticS
 
 
 def test_mapped_segments_come_back_from_disk(mapped: MappedSegment, tmp_path: Path) -> None:
-    write_mapped(tmp_path, mapped)
-    back = read_mapped(tmp_path)
+    MAPPED_SEGMENT.write(tmp_path, mapped)
+    back = MAPPED_SEGMENT.read(tmp_path)
     assert (back.segment, back.attempts, back.unregistered) == (0, mapped.attempts, ())
     assert back.models[0].intrinsics == mapped.models[0].intrinsics
     np.testing.assert_array_equal(back.models[0].seg_from_cam, mapped.models[0].seg_from_cam)
