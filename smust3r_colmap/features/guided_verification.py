@@ -66,9 +66,9 @@ def read_matched_features(database: Path, images: Collection[int]) -> MatchedFea
     wanted = set(images)
     with open_database(database) as opened:
         keypoints = {i: _keypoints(opened, i) for i in sorted(wanted)}
-        raw = _by_pair(*opened.read_all_matches(), wanted)
+        raw = _among(matches_by_pair(*opened.read_all_matches()), wanted)
         pair_ids, geometries = opened.read_two_view_geometries()
-        verified = _by_pair(pair_ids, [one.inlier_matches for one in geometries], wanted)
+        verified = _among(matches_by_pair(pair_ids, [one.inlier_matches for one in geometries]), wanted)
     return MatchedFeatures(keypoints=keypoints, raw=raw, verified=verified)
 
 
@@ -78,15 +78,20 @@ def _keypoints(database: pycolmap.Database, image: int) -> npt.NDArray[np.float3
     return keypoints[:, :2] if len(keypoints) else np.empty((0, 2), np.float32)
 
 
-def _by_pair(
-    pair_ids: Sequence[int], matches: Sequence[npt.NDArray[np.uint32]], wanted: Collection[int]
+def matches_by_pair(
+    pair_ids: Sequence[int], matches: Sequence[npt.NDArray[np.uint32]]
 ) -> dict[Pair, npt.NDArray[np.uint32]]:
+    """(M, 2) rows of keypoints by pair of image indices, of the pairs that have matches."""
     pairs = {}
     for pair_id, rows in zip(pair_ids, matches, strict=True):
         a, b = pycolmap.pair_id_to_image_pair(pair_id)
-        if a - 1 in wanted and b - 1 in wanted and len(rows):
+        if len(rows):
             pairs[a - 1, b - 1] = np.asarray(rows, dtype=np.uint32).reshape(-1, 2)
     return pairs
+
+
+def _among(pairs: Mapping[Pair, npt.NDArray[np.uint32]], wanted: Collection[int]) -> dict[Pair, npt.NDArray[np.uint32]]:
+    return {pair: rows for pair, rows in pairs.items() if pair[0] in wanted and pair[1] in wanted}
 
 
 def verify_guided(features: MatchedFeatures, views: Mapping[int, View], *, tolerance: float) -> VerifiedMatches:

@@ -1,26 +1,39 @@
-"""Matching image pairs in a child process, with two-view verification by COLMAP.
+"""Matching image pairs in child processes, with two-view verification by COLMAP.
 
-The next module to read is ``guided_verification``.
+The next module to read is ``stationary``, which finds what never moves in the image.
 """
 
 from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
 import pycolmap
 
 from smust3r_colmap.colmap.database import internal_name, open_database
 from smust3r_colmap.execution.progress import Stage
-from smust3r_colmap.execution.task_pool import TaskFailure, TaskPool
-from smust3r_colmap.geometry.arrays import Pair
+from smust3r_colmap.execution.task_pool import Executor, TaskFailure, TaskPool
+from smust3r_colmap.features.guided_verification import matches_by_pair
+from smust3r_colmap.features.stationary import (
+    PairMatches,
+    StaticRegions,
+    find_static_regions,
+    static_matches,
+    verified,
+)
+from smust3r_colmap.geometry.arrays import BoolArray, Pair
 
 logger = logging.getLogger(__name__)
 
 _PAIRS_PER_THREAD = 100
+_PAIRS_VERIFIED_AT_ONCE = 500
+"""Their matches are in memory."""
+_WATERMARK = int(pycolmap.TwoViewGeometryConfiguration.WATERMARK)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,3 +90,116 @@ def _match(task: _MatchingTask) -> None:
         pairing.match_list_path = Path(scratch) / "pairs.txt"
         pairing.match_list_path.write_text("".join(f"{internal_name(a)} {internal_name(b)}\n" for a, b in task.pairs))
         pycolmap.match_image_pairs(task.database, matching, pairing, verification, pycolmap.Device.cpu)
+
+
+# ---------------------------------------------------------------------- static parts
+def find_static_parts(path: Path, pairs: Iterable[Pair], *, seed: int) -> StaticRegions:
+    """The parts of the images in which something never moves, from the matches of these pairs; see ``stationary``."""
+    with open_database(path) as database:
+        reader = _PairReader.of(database, pairs)
+    return find_static_regions(reader.pairs, reader.matches, seed=seed)
+
+
+def drop_matches_without_evidence(
+    path: Path, pairs: Iterable[Pair], regions: StaticRegions, *, executor: Executor, seed: int
+) -> None:
+    """Delete stationary matches in static parts and verify those pairs again; empty what COLMAP calls watermarks.
+
+    What was deleted is gone, so a second call finds nothing to do.
+
+    Raises:
+        StorageError: the database cannot be written.
+    """
+    wanted = set(pairs)
+    with open_database(path) as database:
+        watermarks = _watermarks(database) & wanted
+        reader = _PairReader.of(database, wanted)
+        pairs_of_one_size = reader.pairs if regions else []
+        for start in range(0, len(pairs_of_one_size), _PAIRS_VERIFIED_AT_ONCE):
+            tasks = [
+                _VerificationTask(pair=pair, matches=matches, used=~static, seed=seed)
+                for pair in pairs_of_one_size[start : start + _PAIRS_VERIFIED_AT_ONCE]
+                if (static := static_matches(matches := reader.matches(pair), regions)).any()
+            ]
+            for result in executor.map(_verify, tasks):
+                task, value = tasks[result.index], result.value
+                if isinstance(value, TaskFailure):
+                    logger.warning("images %d and %d have no geometry: %s", *task.pair, value.reason)
+                    value = pycolmap.TwoViewGeometry()
+                rows = reader.rows[task.pair]
+                value.inlier_matches = rows[np.asarray(value.inlier_matches, np.int64).reshape(-1, 2)[:, 0]]
+                _replace_matches(database, task.pair, rows[task.used], value)
+                watermarks.discard(task.pair)
+                if value.config == _WATERMARK:
+                    watermarks.add(task.pair)
+        for pair in sorted(watermarks):
+            _replace_matches(database, pair, np.empty((0, 2), np.uint32), pycolmap.TwoViewGeometry())
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _VerificationTask:
+    pair: Pair
+    matches: PairMatches
+    used: BoolArray
+    seed: int
+
+
+def _verify(task: _VerificationTask) -> pycolmap.TwoViewGeometry:
+    return verified(task.matches, task.used, seed=task.seed)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _PairReader:
+    """The unverified matches of pairs of images of one size."""
+
+    rows: Mapping[Pair, npt.NDArray[np.uint32]]
+    keypoints: Mapping[int, npt.NDArray[np.float32]]
+    cameras: Mapping[int, pycolmap.Camera]
+
+    @classmethod
+    def of(cls, database: pycolmap.Database, pairs: Iterable[Pair]) -> _PairReader:
+        camera_by_id = {camera.camera_id: camera for camera in database.read_all_cameras()}
+        cameras = {image.image_id - 1: camera_by_id[image.camera_id] for image in database.read_all_images()}
+        wanted = {(a, b) for a, b in pairs if _size(cameras[a]) == _size(cameras[b])}
+        rows = {pair: rows for pair, rows in matches_by_pair(*database.read_all_matches()).items() if pair in wanted}
+        images = sorted({image for pair in rows for image in pair})
+        keypoints = {image: np.asarray(database.read_keypoints(image + 1), np.float32)[:, :2] for image in images}
+        return cls(rows=rows, keypoints=keypoints, cameras=cameras)
+
+    @property
+    def pairs(self) -> list[Pair]:
+        return sorted(self.rows)
+
+    def matches(self, pair: Pair) -> PairMatches:
+        a, b = pair
+        rows = self.rows[pair]
+        return PairMatches(
+            xy_a=self.keypoints[a][rows[:, 0]].astype(np.float64),
+            xy_b=self.keypoints[b][rows[:, 1]].astype(np.float64),
+            camera_a=self.cameras[a],
+            camera_b=self.cameras[b],
+        )
+
+
+def _size(camera: pycolmap.Camera) -> tuple[int, int]:
+    return camera.width, camera.height
+
+
+def _watermarks(database: pycolmap.Database) -> set[Pair]:
+    pair_ids, geometries = database.read_two_view_geometries()
+    return {
+        (a - 1, b - 1)
+        for (a, b), one in zip(map(pycolmap.pair_id_to_image_pair, pair_ids), geometries, strict=True)
+        if one.config == _WATERMARK
+    }
+
+
+def _replace_matches(
+    database: pycolmap.Database, pair: Pair, rows: npt.NDArray[np.uint32], geometry: pycolmap.TwoViewGeometry
+) -> None:
+    a, b = pair[0] + 1, pair[1] + 1
+    with pycolmap.DatabaseTransaction(database):
+        database.delete_matches(a, b)
+        database.write_matches(a, b, rows)
+        database.delete_two_view_geometry(a, b)
+        database.write_two_view_geometry(a, b, geometry)

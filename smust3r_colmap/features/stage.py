@@ -13,15 +13,18 @@ from smust3r_colmap.colmap.database import create_database, open_database
 from smust3r_colmap.config import FeatureConfig
 from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.execution.run_context import Run
-from smust3r_colmap.features.matching import match_pairs
+from smust3r_colmap.features.matching import drop_matches_without_evidence, find_static_parts, match_pairs
 from smust3r_colmap.features.pairs import alike_pairs, neighbouring_pairs
 from smust3r_colmap.features.sift import extract_features
+from smust3r_colmap.features.stationary import NO_REGIONS, StaticRegions, describe
 from smust3r_colmap.features.vlad import FEATURES_PER_IMAGE, vlad_descriptors
 from smust3r_colmap.geometry.arrays import Float32Array, Pair
 from smust3r_colmap.products import ImageCollection, RunFeatures, Scene
 from smust3r_colmap.storage.codec import Codec
 from smust3r_colmap.storage.run_directory import key_of
 
+_STATIC_REGIONS: Codec[StaticRegions] = Codec(StaticRegions, "static_regions")
+"""Beside the database of the features."""
 _DESCRIPTORS: Codec[Float32Array] = Codec(Float32Array, "descriptors")
 
 
@@ -52,10 +55,13 @@ def features_of_run(run: Run, collection: ImageCollection, options: FeatureConfi
 def match_pairs_of_run(
     run: Run, features: RunFeatures, pairs: Iterable[Pair], *, title: str = "matching"
 ) -> frozenset[Pair]:
-    """Match and verify the pairs whose images have features; see ``match_pairs``."""
+    """Match and verify the pairs whose images have features; see ``match_pairs``.
+
+    Matches on what never moves in the image are dropped, with a warning that names the place.
+    """
     wanted = [(a, b) for a, b in pairs if features.usable[a] and features.usable[b]]
     with run.clock.stage(title, total=len(wanted)) as stage:
-        return match_pairs(
+        matched = match_pairs(
             features.database,
             wanted,
             workers=run.executor.workers,
@@ -63,6 +69,21 @@ def match_pairs_of_run(
             log_file=run.folder.native_log,
             stage=stage,
         )
+        # Stored before anything is dropped, because afterwards it cannot be found again.
+        folder = features.database.parent
+        found = find_static_parts(features.database, matched, seed=run.seed)
+        known = _STATIC_REGIONS.read(folder) if _STATIC_REGIONS.is_in(folder) else NO_REGIONS
+        regions = known.joined(found)
+        if regions != known:
+            _STATIC_REGIONS.write(folder, regions)
+        drop_matches_without_evidence(features.database, matched, regions, executor=run.executor, seed=run.seed)
+    if regions:
+        run.clock.warn(
+            f"part of the image never moves ({describe(regions)}); {regions.share:.0%} of the matches lie there and "
+            "are not used. If it is a part of the camera's mount or an overlay, --masks leaves it out of depth and "
+            "training images, too"
+        )
+    return matched
 
 
 def describe_images(run: Run, features: RunFeatures) -> Float32Array:

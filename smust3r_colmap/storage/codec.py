@@ -41,6 +41,10 @@ class Codec(Generic[T]):
         self._kind = kind
         self._name = name
 
+    def is_in(self, folder: Path) -> bool:
+        """Whether a value was written into ``folder``."""
+        return (folder / f"{self._name}.json").is_file()
+
     def write(self, folder: Path, value: T) -> None:
         """Write ``value`` into an existing folder."""
         arrays: Arrays = {}

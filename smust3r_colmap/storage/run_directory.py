@@ -12,7 +12,7 @@
         lock               held by the process that writes
         native.log         messages of pycolmap's native code
         import/            what was read of each file
-        features/          database.db: keypoints, descriptors, matches, ids = index + 1
+        features/          database.db: keypoints, descriptors, matches, ids = index + 1; static_regions
         descriptors/       one vector per image
         loops/             every candidate for a loop, why it was taken or not, the loop segments
         tokens/            images as the MUSt3R network encoded them; the least recently used give way
@@ -56,7 +56,7 @@ IMPORT_STAGE, STITCHED_STAGE, REFINED_STAGE, SCENE_STAGE = "import", "stitched",
 MODEL_FOLDER, DATABASE_FILE = "model", "database.db"
 """Of the refinement: the model of each scene, and the database that goes with all of them."""
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 """Part of every key; a change of what a stage stores or computes raises it."""
 
 _LOCK_WAIT_S = 3.0
