@@ -6,8 +6,8 @@ which of them belong together. The next module to read is ``registry``.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from smust3r_colmap.colmap.model_files import MODEL_FILES
@@ -46,6 +46,7 @@ class _Parts:
     with_tracks: tuple[bool, ...]
     with_maps: bool
     masks: MaskSet | None
+    timestamps_s: Mapping[str, float] = field(default_factory=dict)
 
 
 _PARTS: Codec[_Parts] = Codec(_Parts, "finished")
@@ -64,6 +65,7 @@ class FinishedRun:
         database: that goes with the models, or None.
         maps: depth of the images, or None.
         masks: those that the run was made with, or None.
+        timestamps_s: capture times of the images that have one, by name.
     """
 
     output: Path
@@ -74,6 +76,7 @@ class FinishedRun:
     database: Path | None
     maps: DepthMaps | None
     masks: MaskSet | None = None
+    timestamps_s: Mapping[str, float] = field(default_factory=dict)
 
     def sparse_model(self, number: int) -> Path:
         """Where the COLMAP model number ``number`` goes."""
@@ -89,6 +92,7 @@ def write_finished(run: RunDirectory, finished: FinishedRun) -> None:
         with_tracks=tuple(model is not None for model in finished.models),
         with_maps=finished.maps is not None,
         masks=None if masks is None else replace(masks, folder=masks.folder.resolve()),
+        timestamps_s=finished.timestamps_s,
     )
     _PARTS.write(run.work, parts)
 
@@ -106,6 +110,7 @@ def begin_stages(run: Run, scan: FolderScan, *, overwrite: bool) -> None:
         run.folder.start_over(MODEL_FILES)
     elif is_of_another_version(run.folder):
         run.clock.note(f"{run.folder.work}: was written by another version; everything is computed again")
+    run.folder.keep_frames(scan.folder)
     with storage_errors(run.folder.work):
         (run.folder.work / FINISHED_FILE).unlink(missing_ok=True)
     store_scan(scan, run.folder)
@@ -150,6 +155,7 @@ def open_finished(run: RunDirectory, *, images: Path | None = None, output: Path
         database=refined / DATABASE_FILE if any(parts.with_tracks) else None,
         maps=StoredDepthMaps(run.work / STITCHED_STAGE) if parts.with_maps else None,
         masks=parts.masks,
+        timestamps_s=parts.timestamps_s,
     )
 
 

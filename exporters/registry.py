@@ -25,7 +25,7 @@ from smust3r_colmap.exporters.glb import write_glb
 from smust3r_colmap.exporters.mesh import MeshMethod, write_mesh
 from smust3r_colmap.exporters.ply import write_ply
 from smust3r_colmap.exporters.training_dataset import write_training_dataset
-from smust3r_colmap.exporters.tum_trajectory import write_tum
+from smust3r_colmap.exporters.tum_trajectory import times_of, write_tum
 from smust3r_colmap.importers.masks import masks_of
 from smust3r_colmap.products import FusedScene, ImageCollection, Scene
 from smust3r_colmap.refinement.stage import InitialScenes, Refinement
@@ -116,13 +116,14 @@ def export(
         database=refinement.database if refinement is not None and has_tracks else None,
         maps=initial.maps,
         masks=masks_of(collection, config.masks),
+        timestamps_s={one.name: one.timestamp_s for one in collection.images if one.timestamp_s is not None},
     )
     settings = FormatSettings.of(config.output)
     with run.clock.stage("export", total=1) as progress:
         for name in ("sparse", "ply", "glb", "tum", *(("database",) if has_tracks else ())):
             FORMATS[name].write(finished, settings)
         for name, scene in {"trajectory_stitched_tum.txt": initial.scenes[0], **before}.items():
-            write_tum(scene, run.folder.root / name, None)
+            write_tum(scene, run.folder.root / name, times_of(scene, finished.timestamps_s))
         write_atomically(run.folder.root / "config.toml", config_to_toml(config).encode())
         write_finished(run.folder, finished)
         progress.advance()
@@ -195,7 +196,8 @@ def write_viewer_file(finished: FinishedRun, settings: FormatSettings) -> Writte
 
 def write_trajectory(finished: FinishedRun, settings: FormatSettings) -> Written:
     """``trajectory_tum.txt`` of the largest model."""
-    write_tum(finished.scenes[0], finished.output / "trajectory_tum.txt", None)
+    scene = finished.scenes[0]
+    write_tum(scene, finished.output / "trajectory_tum.txt", times_of(scene, finished.timestamps_s))
     return Written(name="trajectory_tum.txt")
 
 

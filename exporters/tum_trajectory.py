@@ -6,7 +6,8 @@ camera axes x right, y down, z forward, as evo and the benchmark's own tools rea
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,20 @@ def write_tum(scene: Scene, path: Path, timestamps_s: Sequence[float] | None) ->
         for time, centre, quat in zip(times[order], world_from_cam[:, :, 3], quat_xyzw, strict=True)
     ]
     write_atomically(path, ("\n".join([_HEADER, *lines]) + "\n").encode("ascii"))
+
+
+def times_of(scene: Scene, timestamps_s: Mapping[str, float]) -> tuple[float, ...] | None:
+    """The time of each image of a scene, where they make one sequence; None for ``write_tum`` to number the images.
+
+    Images without a time, or several videos that each begin anew, are no sequence.
+
+    Args:
+        scene: one connected model.
+        timestamps_s: capture times by image name.
+    """
+    times = tuple(timestamps_s[name] for name in scene.image_names if name in timestamps_s)
+    is_sequence = len(times) == len(scene) and all(a < b for a, b in pairwise(times))
+    return times if is_sequence else None
 
 
 def continuous_quat_xyzw(rotations: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

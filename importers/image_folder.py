@@ -27,6 +27,7 @@ from smust3r_colmap.errors import CollectionError, ConfigError, ImageError
 from smust3r_colmap.execution.task_pool import usable_cores
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.camera_prior import DEFAULT_FOCAL_RATIO, focal_prior_px
+from smust3r_colmap.importers.frame_times import frame_times
 from smust3r_colmap.importers.images import MAX_FILE_BYTES, SUFFIXES, Photo, inspect
 from smust3r_colmap.products import ImageCollection, RejectedImage, SourceImage
 from smust3r_colmap.storage.digest import digest_of
@@ -193,7 +194,7 @@ def _list_folder(folder: Path) -> _Listing:
     names: list[str] = []
     unreadable: list[RejectedImage] = []
     other_suffixes: Counter[str] = Counter()
-    for name, problem in _walk(folder):
+    for name, problem in walk(folder):
         suffix = PurePosixPath(name).suffix.lower()
         if not problem and suffix not in SUFFIXES:
             other_suffixes[suffix] += 1
@@ -205,7 +206,7 @@ def _list_folder(folder: Path) -> _Listing:
     return _Listing(names=tuple(names), unreadable=tuple(unreadable), other_suffixes=other_suffixes)
 
 
-def _walk(folder: Path) -> Iterator[tuple[str, str]]:
+def walk(folder: Path) -> Iterator[tuple[str, str]]:
     """Names of all files below the folder, each with an empty reason, and of unreadable folders with one.
 
     Hidden files and folders are passed over. Links are followed after all real folders, and no folder is
@@ -318,6 +319,7 @@ def collection_from_scan(scan: FolderScan, config: CameraConfig) -> ImageCollect
     if config.camera_params is not None:
         cameras = _known_cameras(cameras, config.camera_params, config.camera_model)
     camera_of = {index: camera for camera, members in enumerate(groups) for index in members}
+    times = frame_times(scan.folder)
     images = tuple(
         SourceImage(
             name=image.name,
@@ -326,6 +328,7 @@ def collection_from_scan(scan: FolderScan, config: CameraConfig) -> ImageCollect
             height=image.photo.height,
             camera=camera_of[index],
             digest=image.digest,
+            timestamp_s=times.get(image.name),
         )
         for index, image in enumerate(usable)
     )

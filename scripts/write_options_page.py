@@ -22,6 +22,7 @@ import tyro
 from smust3r_colmap.cli.demo import Demo
 from smust3r_colmap.cli.doctor import Doctor
 from smust3r_colmap.cli.export import Export
+from smust3r_colmap.cli.frames import Frames
 from smust3r_colmap.cli.presets import PRESETS
 from smust3r_colmap.cli.reconstruct import Reconstruct
 from smust3r_colmap.cli.refine import Refine
@@ -34,6 +35,7 @@ PAGE = Path(__file__).resolve().parents[1] / "docs/options.md"
 COMMANDS: Mapping[str, type] = {
     "reconstruct": Reconstruct,
     "refine": Refine,
+    "frames": Frames,
     "export": Export,
     "validate": Validate,
     "demo": Demo,

@@ -50,6 +50,25 @@ class CameraConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class VideoConfig:
+    """Frames of videos.
+
+    By default a frame is taken when the image has moved by a twentieth of its longer side since the last one.
+    """
+
+    fps: float | None = None
+    """Take so many frames per second of video instead, the sharpest of each interval."""
+    max_frames: int | None = None
+    """Take at most so many frames of each video instead, evenly spread in time; with --fps, whatever is less."""
+
+    def __post_init__(self) -> None:
+        if self.fps is not None and not 0 < self.fps < math.inf:
+            raise ConfigError(f"--fps {self.fps}: must be above 0, and finite")
+        if self.max_frames is not None:
+            _check_at_least(self, max_frames=1)
+
+
+@dataclass(frozen=True, kw_only=True)
 class SegmentationConfig:
     """Cutting the sequence (paper section III-B)."""
 
@@ -293,6 +312,7 @@ class RunConfig:
     """Of every random choice; with --workers 1, the same seed gives the same result to the last bit."""
     cameras: CameraConfig = field(default_factory=CameraConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
+    video: VideoConfig = field(default_factory=VideoConfig)
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
     features: FeatureConfig = field(default_factory=FeatureConfig)
     classical: ClassicalConfig = field(default_factory=ClassicalConfig)

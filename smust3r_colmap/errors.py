@@ -4,6 +4,7 @@
     +-- InputError                the caller gave something unusable
     |   +-- ConfigError           an option, or a combination of options
     |   +-- ImageError            one image file
+    |   +-- VideoError            one video file
     |   +-- CollectionError       the set of images as a whole
     |   +-- CheckpointError       a file of network weights
     +-- ReconstructionError       the images are fine, the geometry did not come out
@@ -49,6 +50,10 @@ class ConfigError(InputError):
 
 class ImageError(InputError):
     """One image file cannot be used; the run goes on without it."""
+
+
+class VideoError(InputError):
+    """One video file cannot be used; a run goes on without it where there is something else."""
 
 
 class CollectionError(InputError):

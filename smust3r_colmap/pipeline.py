@@ -46,10 +46,10 @@ def reconstruct(
     reporter: Reporter,
     factory: BackboneFactory = make_backbone,
 ) -> RunSummary:
-    """From a folder of images to COLMAP models in ``output/sparse``.
+    """From images or videos to COLMAP models in ``output/sparse``.
 
     Args:
-        images: folder with the photographs, in the natural order of their names.
+        images: folder with photographs, in the natural order of their names, and videos; or a video.
         output: made when missing; what an earlier run finished there is used.
         overwrite: start over instead.
         reporter: told about every stage.
@@ -62,7 +62,8 @@ def reconstruct(
     """
     importers.check_folders(images, output, config.masks)
     with Run.open(output, workers=num_workers(config.workers), seed=config.seed, reporter=reporter) as run:
-        scan, collection = importers.read_images(run, images, config, overwrite=overwrite)
+        source = importers.take_frames(run, images, config, overwrite=overwrite)
+        scan, collection = importers.read_images(run, source, config, overwrite=overwrite)
         backbone = backbones.make(run, factory, collection, config)
         begin_stages(run, scan, overwrite=overwrite)
         segments = segmentation.plan(run, len(collection), backbone.describe, config.segmentation, config.loop_closing)
@@ -72,5 +73,7 @@ def reconstruct(
         initial = refinement.InitialScenes.of(stitched, segments, maps_key=submodels.dense_key)
         refined = refinement.refine(run, initial, collection, submodels.features, config.refinement, config.features)
         fused = dense.fuse(run, submodels, segments, stitched, refined, config.fusion)
-        outputs = exporters.export(run, fused, refined, initial, images, collection, config, before=stitched.before)
+        outputs = exporters.export(
+            run, fused, refined, initial, source.folder, collection, config, before=stitched.before
+        )
         return report.reconstruction(run, collection, segments, submodels, edges, stitched, refined, fused, outputs)

@@ -38,14 +38,16 @@ _PACKAGES = (
     ("opencv-python-headless", "import cv2"),
     ("pillow", "import PIL"),
     ("trimesh", "import trimesh"),
+    ("av", "import av"),
     ("open3d", "import open3d\nif open3d.core.cuda.is_available(): print('CUDA')"),
 )
 
-# They may be broken and a reconstruction still works: open3d is for meshes only, torch for networks.
-_NOT_NEEDED = frozenset({"open3d", "torch"})
+# They may be broken and a reconstruction still works: av is for video only, open3d for meshes, torch for networks.
+_NOT_NEEDED = frozenset({"av", "open3d", "torch"})
 
 _PARTS = (
     ("importer", "image folder", "smust3r_colmap.importers.image_folder"),
+    ("importer", "video", "smust3r_colmap.importers.video_frames"),
     ("importer", "COLMAP model", "smust3r_colmap.importers.colmap_model"),
     ("exporter", "COLMAP model", "smust3r_colmap.exporters.colmap_sparse"),
     ("exporter", "COLMAP database", "smust3r_colmap.colmap.database"),

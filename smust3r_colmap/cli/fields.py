@@ -26,7 +26,13 @@ from tyro.constructors import (
 
 REGISTRY = ConstructorRegistry()
 
-_METAVARS = {str | None: "STR", Path | None: "PATH", tuple[int, ...] | None: "INT,INT,..."}
+_METAVARS = {
+    str | None: "STR",
+    Path | None: "PATH",
+    int | None: "INT",
+    float | None: "FLOAT",
+    tuple[int, ...] | None: "INT,INT,...",
+}
 
 
 @cache

@@ -24,6 +24,7 @@ from smust3r_colmap.cli.demo import Demo, run_demo
 from smust3r_colmap.cli.doctor import Doctor, run_doctor
 from smust3r_colmap.cli.export import Export, run_export
 from smust3r_colmap.cli.fields import REGISTRY
+from smust3r_colmap.cli.frames import Frames, run_frames
 from smust3r_colmap.cli.presets import PRESETS
 from smust3r_colmap.cli.reconstruct import Reconstruct, run_reconstruct
 from smust3r_colmap.cli.refine import Refine, run_refine
@@ -39,9 +40,9 @@ _DESCRIPTION = """Offline structure from motion for COLMAP workflows, segment by
 Exit codes: 0 good, 1 failed, 2 wrong use, 3 finished with warnings, 130 interrupted.
 --version prints the version."""
 
-Command = Reconstruct | Refine | Export | Validate | Demo | Doctor | WeightsCommand
+Command = Reconstruct | Refine | Frames | Export | Validate | Demo | Doctor | WeightsCommand
 
-COMMANDS = ("reconstruct", "refine", "export", "validate", "demo", "doctor", "weights")
+COMMANDS = ("reconstruct", "refine", "frames", "export", "validate", "demo", "doctor", "weights")
 SETTINGS = {"reconstruct": RunConfig, "refine": RefineConfig}
 """The commands that take a settings file, and what it may hold."""
 
@@ -116,6 +117,8 @@ def _run(command: Command) -> int:  # noqa: PLR0911  (one return per command)
             return run_reconstruct(command)
         case Refine():
             return run_refine(command)
+        case Frames():
+            return run_frames(command)
         case Export():
             return run_export(command)
         case Validate():

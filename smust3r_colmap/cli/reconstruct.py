@@ -15,10 +15,10 @@ from smust3r_colmap.config import RunConfig
 
 @dataclass(frozen=True, kw_only=True)
 class Reconstruct:
-    """Reconstruct a folder of images; start the same command again to go on after an interruption."""
+    """Reconstruct images or videos; start the same command again to go on after an interruption."""
 
     images: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IMAGES")]
-    """Folder of images, in the order of their names."""
+    """Folder of images, in the order of their names, and of videos; or a video."""
     output: Annotated[Path, tyro.conf.arg(metavar="OUT")]
     """Folder of the result; made when missing."""
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None
@@ -36,7 +36,7 @@ class Reconstruct:
 
 
 def run_reconstruct(command: Reconstruct) -> int:
-    """Reconstruct the folder; the exit code."""
+    """Reconstruct the images; the exit code."""
     from smust3r_colmap.pipeline import reconstruct  # noqa: PLC0415  (heavy: --help shall not pay for it)
 
     with reporting(quiet=command.quiet, verbose=command.verbose) as reporter:

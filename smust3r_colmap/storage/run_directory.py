@@ -11,6 +11,7 @@
       work/
         lock               held by the process that writes
         native.log         messages of pycolmap's native code
+        frames/            frames of videos, with links to the other images
         import/            what was read of each file
         features/          database.db: keypoints, descriptors, matches, ids = index + 1; static_regions
         descriptors/       one vector per image
@@ -53,6 +54,8 @@ from smust3r_colmap.storage.digest import digest_of
 
 IMPORT_STAGE, STITCHED_STAGE, REFINED_STAGE, SCENE_STAGE = "import", "stitched", "refined", "scene"
 """Folders below ``work`` that are read again when a finished run is exported."""
+FRAMES_STAGE = "frames"
+"""Below ``work``: for each set of videos a folder of images."""
 MODEL_FOLDER, DATABASE_FILE = "model", "database.db"
 """Of the refinement: the model of each scene, and the database that goes with all of them."""
 
@@ -148,11 +151,18 @@ class RunDirectory:
                     folder.rmdir()
 
     def start_over(self, model_files: Collection[str]) -> None:
-        """Throw away what an earlier run left: its results, as ``clear_results`` does, and all of ``work``."""
+        """Throw away what an earlier run left: its results, as ``clear_results`` does, and ``work`` but for frames."""
         self.clear_results(model_files)
         with storage_errors(self.work):
             for path in self.work.iterdir():
-                if path.name != "lock":
+                if path.name not in ("lock", FRAMES_STAGE):
+                    _remove(path)
+
+    def keep_frames(self, images: Path) -> None:
+        """Throw away the frames of videos that an earlier run took, unless they are the images of this one."""
+        with storage_errors(self.work):
+            for path in self.work.glob(f"{FRAMES_STAGE}/*"):
+                if path != images:
                     _remove(path)
 
 

@@ -193,7 +193,7 @@ def test_an_unknown_command_exits_2_with_those_there_are(
     assert cli.main([typed, "photos"]) == 2
     assert capsys.readouterr().err == (
         f"smust3r-colmap: there is no command {typed!r}{meant}; "
-        "the commands are reconstruct, refine, export, validate, demo, doctor, weights\n"
+        "the commands are reconstruct, refine, frames, export, validate, demo, doctor, weights\n"
     )
 
 

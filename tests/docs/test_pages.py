@@ -28,7 +28,7 @@ FLAGS_OF_OTHERS = {
     "--data-dir",  # gsplat
     "--data-factor",
 }
-SHELL_WORDS = {"pip", "python", "ffmpeg", "colmap", "mkdir"}
+SHELL_WORDS = {"pip", "python", "colmap", "mkdir"}
 """Commands of other programs that pages show; those of COLMAP are run as Python beside them."""
 
 RUN_HERE = ("export", "validate", "weights list")

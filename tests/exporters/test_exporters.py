@@ -23,7 +23,7 @@ from smust3r_colmap.errors import InputError, RunDirectoryError, StorageError
 from smust3r_colmap.exporters.colmap_sparse import write_colmap_sparse
 from smust3r_colmap.exporters.glb import frustum_depth, write_glb
 from smust3r_colmap.exporters.ply import write_ply
-from smust3r_colmap.exporters.tum_trajectory import write_tum
+from smust3r_colmap.exporters.tum_trajectory import times_of, write_tum
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.geometry.world_frame import WorldFrame
@@ -404,3 +404,17 @@ def test_tum_refuses_timestamps_that_do_not_fit(tmp_path: Path, times: list[floa
     with pytest.raises(InputError, match=message):
         write_tum(scene(), tmp_path / "trajectory.txt", times)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("times", "expected"),
+    [
+        ([0.0, 0.5, 0.75, 9.0], (0.0, 0.5, 0.75, 9.0)),
+        ([0.0, 0.5, 0.0, 0.5], None),  # two videos
+        ([0.0, 0.5, 0.75], None),  # an image that is no frame
+        ([], None),
+    ],
+)
+def test_times_are_used_where_they_make_one_sequence(times: list[float], expected: tuple[float, ...] | None) -> None:
+    named = dict(zip(scene().image_names, times, strict=False))
+    assert times_of(scene(), {**named, "of another model.jpg": 3.0}) == expected

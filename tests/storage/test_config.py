@@ -77,6 +77,7 @@ def test_settings_of_refine_survive_the_way_through_toml(tmp_path: Path) -> None
 def test_what_is_not_given_is_a_comment(tmp_path: Path) -> None:
     text = config_to_toml(RunConfig())
     absent = {"backbone_options", "masks", "camera_params", "trainer_scales", "weights", "retrieval_weights"}
+    absent |= {"fps", "max_frames"}
     assert {line.split()[1] for line in text.splitlines() if line.endswith("is not given")} == absent
     assert 'workers = "auto"' in text and 'loop_similarity = "auto"' in text and 'network_memory = "auto"' in text
 
