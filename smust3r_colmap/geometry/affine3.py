@@ -14,11 +14,11 @@ import numpy.typing as npt
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.geometry.so3 import determinant, nearest_rotation
-from smust3r_colmap.geometry.transform import Transform, affine_parts, jacobian_of_linear
+from smust3r_colmap.geometry.transform import AffineTransform, affine_parts
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Affine3(Transform):
+class Affine3(AffineTransform):
     """``b_from_a``: x_b = linear @ x_a + translation, with any leading batch axes.
 
     A tangent vector is (translation 3, linear part 3x3 row by row). Not every element has a
@@ -35,7 +35,6 @@ class Affine3(Transform):
     DOF: ClassVar[int] = 12
 
     linear: FloatArray
-    translation: FloatArray
 
     def __post_init__(self) -> None:
         linear = np.asarray(self.linear, dtype=np.float64)
@@ -68,19 +67,9 @@ class Affine3(Transform):
         linear, translation = affine_parts(matrix)
         return cls(linear=linear, translation=translation)
 
-    @property
-    def batch(self) -> tuple[int, ...]:
-        """The leading axes."""
-        return self.linear.shape[:-2]
-
-    @property
-    def matrix(self) -> FloatArray:
-        """(..., 4, 4) homogeneous matrix."""
-        out = np.zeros((*self.batch, 4, 4))
-        out[..., :3, :3] = self.linear
-        out[..., :3, 3] = self.translation
-        out[..., 3, 3] = 1.0
-        return out
+    def linear_part(self) -> FloatArray:
+        """(..., 3, 3)."""
+        return self.linear
 
     @classmethod
     def hat(cls, tangent: npt.ArrayLike) -> FloatArray:
@@ -97,15 +86,6 @@ class Affine3(Transform):
         matrix = np.asarray(algebra, dtype=np.float64)
         rows = matrix[..., :3, :3].reshape(*matrix.shape[:-2], 9)
         return np.concatenate([matrix[..., :3, 3], rows], axis=-1)
-
-    def apply(self, points_a: npt.ArrayLike) -> FloatArray:
-        """Points (..., N, 3) in frame a to frame b; rows that are not finite stay so."""
-        points = np.asarray(points_a, dtype=np.float64)
-        return points @ np.swapaxes(self.linear, -1, -2) + self.translation[..., None, :]
-
-    def jacobian(self, points_a: npt.ArrayLike) -> FloatArray:
-        """(..., N, 3, 3) the linear part, at every point."""
-        return jacobian_of_linear(self.linear, points_a)
 
     def inverse(self) -> Affine3:
         """``a_from_b``."""

@@ -23,11 +23,11 @@ from smust3r_colmap.geometry.so3 import (
     skew,
     unskew,
 )
-from smust3r_colmap.geometry.transform import Transform, affine_parts, jacobian_of_linear
+from smust3r_colmap.geometry.transform import AffineTransform, affine_parts
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SE3(Transform):
+class SE3(AffineTransform):
     """``b_from_a``: x_b = rotation @ x_a + translation, with any leading batch axes.
 
     A tangent vector is (translation 3, rotation vector 3).
@@ -43,7 +43,6 @@ class SE3(Transform):
     DOF: ClassVar[int] = 6
 
     rotation: FloatArray
-    translation: FloatArray
 
     def __post_init__(self) -> None:
         rotation = np.asarray(self.rotation, dtype=np.float64)
@@ -76,19 +75,9 @@ class SE3(Transform):
         rotation, translation = affine_parts(matrix)
         return cls(rotation=rotation, translation=translation)
 
-    @property
-    def batch(self) -> tuple[int, ...]:
-        """The leading axes."""
-        return self.rotation.shape[:-2]
-
-    @property
-    def matrix(self) -> FloatArray:
-        """(..., 4, 4) homogeneous matrix."""
-        out = np.zeros((*self.batch, 4, 4))
-        out[..., :3, :3] = self.rotation
-        out[..., :3, 3] = self.translation
-        out[..., 3, 3] = 1.0
-        return out
+    def linear_part(self) -> FloatArray:
+        """(..., 3, 3)."""
+        return self.rotation
 
     @classmethod
     def hat(cls, tangent: npt.ArrayLike) -> FloatArray:
@@ -127,15 +116,6 @@ class SE3(Transform):
     def log_exists(self) -> BoolArray:
         """(...,) true: every rigid motion has a logarithm, a rotation of pi has two."""
         return np.ones(self.batch, dtype=bool)
-
-    def apply(self, points_a: npt.ArrayLike) -> FloatArray:
-        """Points (..., N, 3) in frame a to frame b; rows that are not finite stay so."""
-        points = np.asarray(points_a, dtype=np.float64)
-        return points @ np.swapaxes(self.rotation, -1, -2) + self.translation[..., None, :]
-
-    def jacobian(self, points_a: npt.ArrayLike) -> FloatArray:
-        """(..., N, 3, 3) the rotation, at every point."""
-        return jacobian_of_linear(self.rotation, points_a)
 
     def inverse(self) -> SE3:
         """``a_from_b``."""

@@ -25,11 +25,11 @@ from smust3r_colmap.geometry.so3 import (
     skew,
     unskew,
 )
-from smust3r_colmap.geometry.transform import Transform, affine_parts, jacobian_of_linear
+from smust3r_colmap.geometry.transform import AffineTransform, affine_parts
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sim3(Transform):
+class Sim3(AffineTransform):
     """``b_from_a``: x_b = scale * rotation @ x_a + translation, with any leading batch axes.
 
     A tangent vector is (translation 3, rotation vector 3, log scale 1).
@@ -47,7 +47,6 @@ class Sim3(Transform):
 
     scale: FloatArray
     rotation: FloatArray
-    translation: FloatArray
 
     def __post_init__(self) -> None:
         scale = np.asarray(self.scale, dtype=np.float64)
@@ -91,19 +90,9 @@ class Sim3(Transform):
             rotation = linear / scale[..., None, None]
         return cls(scale=scale, rotation=rotation, translation=translation)
 
-    @property
-    def batch(self) -> tuple[int, ...]:
-        """The leading axes."""
-        return self.scale.shape
-
-    @property
-    def matrix(self) -> FloatArray:
-        """(..., 4, 4) homogeneous matrix."""
-        out = np.zeros((*self.scale.shape, 4, 4))
-        out[..., :3, :3] = self.scale[..., None, None] * self.rotation
-        out[..., :3, 3] = self.translation
-        out[..., 3, 3] = 1.0
-        return out
+    def linear_part(self) -> FloatArray:
+        """(..., 3, 3)."""
+        return self.scale[..., None, None] * self.rotation
 
     @classmethod
     def hat(cls, tangent: npt.ArrayLike) -> FloatArray:
@@ -149,12 +138,6 @@ class Sim3(Transform):
         """(...,) true: every similarity has a logarithm, a rotation of pi has two."""
         return np.ones(self.batch, dtype=bool)
 
-    def apply(self, points_a: npt.ArrayLike) -> FloatArray:
-        """Points (..., N, 3) in frame a to frame b; rows that are not finite stay so."""
-        points = np.asarray(points_a, dtype=np.float64)
-        linear = self.scale[..., None, None] * self.rotation
-        return points @ np.swapaxes(linear, -1, -2) + self.translation[..., None, :]
-
     def inverse(self) -> Sim3:
         """``a_from_b``."""
         scale = 1.0 / self.scale
@@ -180,10 +163,6 @@ class Sim3(Transform):
         out[..., 3:6, 3:6] = self.rotation
         out[..., 6, 6] = 1.0
         return out
-
-    def jacobian(self, points_a: npt.ArrayLike) -> FloatArray:
-        """(..., N, 3, 3) ``scale * rotation`` at every point."""
-        return jacobian_of_linear(self.scale[..., None, None] * self.rotation, points_a)
 
 
 def _parts(tangent: npt.ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:

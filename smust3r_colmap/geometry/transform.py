@@ -162,6 +162,42 @@ class Transform(ABC):
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AffineTransform(Transform):
+    """A transform that is a linear part and a translation: Sim(3), SE(3) and Affine(3)."""
+
+    translation: FloatArray
+
+    @abstractmethod
+    def linear_part(self) -> FloatArray:
+        """(..., 3, 3)."""
+
+    @property
+    def batch(self) -> tuple[int, ...]:
+        """The leading axes."""
+        return self.translation.shape[:-1]
+
+    @property
+    def matrix(self) -> FloatArray:
+        """(..., 4, 4) homogeneous matrix."""
+        out = np.zeros((*self.batch, 4, 4))
+        out[..., :3, :3] = self.linear_part()
+        out[..., :3, 3] = self.translation
+        out[..., 3, 3] = 1.0
+        return out
+
+    def apply(self, points_a: npt.ArrayLike) -> FloatArray:
+        """Points (..., N, 3) in frame a to frame b; rows that are not finite stay so."""
+        points = np.asarray(points_a, dtype=np.float64)
+        return points @ np.swapaxes(self.linear_part(), -1, -2) + self.translation[..., None, :]
+
+    def jacobian(self, points_a: npt.ArrayLike) -> FloatArray:
+        """(..., N, 3, 3) the linear part, which is the same at all points (..., N, 3)."""
+        linear, points = self.linear_part(), np.asarray(points_a, dtype=np.float64)
+        batch = np.broadcast_shapes(linear.shape[:-2], points.shape[:-2])
+        return np.tile(np.broadcast_to(linear[..., None, :, :], (*batch, 1, 3, 3)), (points.shape[-2], 1, 1))
+
+
 @cache
 def _structure_constants(group: type[Transform]) -> FloatArray:
     """(DOF, DOF, DOF) small adjoints of the unit tangent vectors."""
@@ -184,10 +220,3 @@ def affine_parts(matrix: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
     if not off <= 1e-9:
         raise ValueError(f"the last row is not (0, 0, 0, 1) but {off:.2g} off: the transform is projective")
     return b_from_a[..., :3, :3], b_from_a[..., :3, 3]
-
-
-def jacobian_of_linear(linear: FloatArray, points_a: npt.ArrayLike) -> FloatArray:
-    """(..., N, 3, 3) of a linear part (..., 3, 3) that is the same at all points (..., N, 3)."""
-    points = np.asarray(points_a, dtype=np.float64)
-    batch = np.broadcast_shapes(linear.shape[:-2], points.shape[:-2])
-    return np.tile(np.broadcast_to(linear[..., None, :, :], (*batch, 1, 3, 3)), (points.shape[-2], 1, 1))
