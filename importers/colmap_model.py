@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,12 +20,17 @@ from smust3r_colmap.errors import InputError
 from smust3r_colmap.geometry.arrays import FloatArray, IntArray
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.colmap_records import CameraRecord, Fixes, ImageRecord, PointRecords, read_records
+from smust3r_colmap.importers.intrinsics_units import in_pixels
+from smust3r_colmap.importers.rig_poses import Pose, is_same_pose
 from smust3r_colmap.products import EMPTY_CLOUD, PointCloud, RejectedImage
 
 logger = logging.getLogger(__name__)
 
 
 MIN_IMAGES = 2
+UNUSABLE_MODELS = ("EQUIRECTANGULAR", "EUCM")
+"""Camera models of COLMAP that are not adjusted: a panorama has no focal length and sees behind itself, and the shape
+parameter of the other is above 1, which COLMAP's mapper takes for a broken distortion."""
 QUATERNION_ROUNDING = 1e-4
 """How far the length of a quaternion may be from 1 without a word: text with five digits."""
 MAX_QUATERNION_LENGTH_ERROR = 0.1
@@ -98,7 +103,8 @@ def read_colmap_model(folder: Path) -> ExternalModel:
     """
     fixes = Fixes()
     records = read_records(folder, fixes)
-    posed = [record for record in records.images if np.isfinite(record.numbers).all()]
+    images = [_by_frame(record, records.poses_by_frame, fixes) for record in records.images]
+    posed = [record for record in images if np.isfinite(record.numbers).all()]
     if len(posed) < MIN_IMAGES:
         raise InputError(
             f"{records.folder}: {len(posed)} of {len(records.images)} images have a pose, needed are {MIN_IMAGES}"
@@ -109,16 +115,17 @@ def read_colmap_model(folder: Path) -> ExternalModel:
     _refuse_twins([(name, record.place) for name, record in zip(names, posed, strict=True)], "image name")
     cameras = {record.camera_id: record for record in records.cameras}
     first_image_of = {record.camera_id: record for record in reversed(posed)}
+    intrinsics = {camera_id: _intrinsics(cameras, image, fixes) for camera_id, image in sorted(first_image_of.items())}
     model = ExternalModel(
         folder=records.folder,
         names=tuple(names),
         camera_ids=tuple(record.camera_id for record in posed),
-        cameras={camera_id: _intrinsics(cameras, image) for camera_id, image in sorted(first_image_of.items())},
+        cameras=intrinsics,
         cam_from_world=np.stack([_cam_from_world(record, fixes) for record in posed]),
         surface=_surface(records.points, [record.image_id for record in posed], records.folder, fixes),
         unposed=tuple(
             RejectedImage(name=record.name, reason=f"its pose in the model is not finite ({record.place})")
-            for record in records.images
+            for record in images
             if record not in posed
         ),
         fixes=fixes.texts(),
@@ -135,6 +142,17 @@ def _refuse_twins(keys: Sequence[tuple[Hashable, str]], what: str) -> None:
         place_of[key] = place
 
 
+def _by_frame(record: ImageRecord, poses: Mapping[int, Pose], fixes: Fixes) -> ImageRecord:
+    """With the pose of its frame where the line of the image says another, as COLMAP reads it."""
+    numbers = poses.get(record.image_id)
+    if numbers is None or is_same_pose(record.numbers, numbers):
+        return record
+    fixes.note(
+        "images have another pose in their line than by rigs and frames, which were taken as COLMAP does", record.place
+    )
+    return replace(record, numbers=numbers)
+
+
 def _tidy_name(record: ImageRecord, fixes: Fixes) -> str:
     """With forward slashes, as names are in COLMAP."""
     fixes.note("image names with backslashes", record.place, count="\\" in record.name)
@@ -144,8 +162,8 @@ def _tidy_name(record: ImageRecord, fixes: Fixes) -> str:
     return name
 
 
-def _intrinsics(cameras: Mapping[int, CameraRecord], image: ImageRecord) -> Intrinsics:
-    """The camera of an image, as numbers that COLMAP can use."""
+def _intrinsics(cameras: Mapping[int, CameraRecord], image: ImageRecord, fixes: Fixes) -> Intrinsics:
+    """The camera of an image, in pixels, as numbers that COLMAP can use."""
     record = cameras.get(image.camera_id)
     if record is None:
         known = ", ".join(map(str, sorted(cameras)[:5])) or "none"
@@ -158,12 +176,22 @@ def _intrinsics(cameras: Mapping[int, CameraRecord], image: ImageRecord) -> Intr
         )
     except ValueError as error:
         raise InputError(f"{record.place}: camera {record.camera_id} cannot be used: {error}") from error
-    focal = [record.params[k] for k in intrinsics.colmap_camera().focal_length_idxs()]
-    if any(value <= 0 for value in focal):
+    if record.model in UNUSABLE_MODELS:
         raise InputError(
-            f"{record.place}: camera {record.camera_id} has focal length {min(focal):g}; it must be positive"
+            f"{record.place}: camera {record.camera_id} is {record.model}, which is not adjusted here; make images of "
+            "a perspective or fisheye camera of it (OPENCV, OPENCV_FISHEYE, ...), and a model of these"
         )
-    return intrinsics
+    num_focal = len(intrinsics.colmap_camera().focal_length_idxs())
+    mended = in_pixels(
+        record.params,
+        record.width,
+        record.height,
+        num_focal=num_focal,
+        place=record.place,
+        camera=f"camera {record.camera_id}",
+    )
+    fixes.note(mended.what, record.place, count=bool(mended.what))
+    return replace(intrinsics, params=mended.params)
 
 
 def _cam_from_world(record: ImageRecord, fixes: Fixes) -> FloatArray:

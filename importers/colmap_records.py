@@ -3,10 +3,9 @@
 Read here and not by pycolmap, because pycolmap refuses, without naming a line, much of what other programs write:
 points whose tracks name images that do not exist, ``images.txt`` without its empty lines, a folder without points.
 Defects with only one meaning are repaired and counted; others are refused with file, line and number. Observations
-(``points2D``) and the files of rigs and frames are skipped: poses in ``images`` are complete without them, and
-refinement finds observations of its own.
+(``points2D``) are skipped: refinement finds observations of its own.
 
-Layout: https://colmap.github.io/format.html. The next module to read is ``colmap_model``.
+Layout: https://colmap.github.io/format.html. The next module to read is ``rig_poses``.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import codecs
 import struct
 from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ import pycolmap
 
 from smust3r_colmap.errors import InputError
 from smust3r_colmap.geometry.arrays import FloatArray, IntArray
+from smust3r_colmap.importers.rig_poses import Pose, poses_by_image
 
 _WHERE_MODELS_LIE = ("", "sparse/0", "sparse", "0")
 """Below the folder that a person names; the first that holds cameras and images is taken."""
@@ -80,12 +80,14 @@ class ModelRecords:
         folder: where they lie.
         cameras, images: in the order of the files.
         points: None where there is no such file.
+        poses_by_frame: by image id, cam from world as rigs and frames have it; empty without these files.
     """
 
     folder: Path
     cameras: tuple[CameraRecord, ...]
     images: tuple[ImageRecord, ...]
     points: PointRecords | None
+    poses_by_frame: Mapping[int, Pose]
 
 
 class Fixes:
@@ -123,12 +125,14 @@ def read_records(folder: Path, fixes: Fixes) -> ModelRecords:
             cameras=tuple(_binary_cameras(_Cursor(cameras, fixes))),
             images=tuple(_binary_images(_Cursor(images, fixes))),
             points=_binary_points(_Cursor(points, fixes)) if points.exists() else None,
+            poses_by_frame=poses_by_image(place, suffix),
         )
     return ModelRecords(
         folder=place,
         cameras=tuple(_text_cameras(cameras)),
         images=tuple(_text_images(images, fixes)),
         points=_text_points(points, fixes) if points.exists() else None,
+        poses_by_frame=poses_by_image(place, suffix),
     )
 
 

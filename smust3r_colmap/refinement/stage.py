@@ -19,11 +19,13 @@ import pycolmap
 from smust3r_colmap.colmap.database import open_database
 from smust3r_colmap.colmap.reconstruction import cameras_of, poses_of
 from smust3r_colmap.config import FeatureConfig, RefinementConfig, SegmentationConfig, TrackConfig
-from smust3r_colmap.errors import ConfigError
+from smust3r_colmap.errors import ConfigError, InputError
 from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.execution.task_pool import TaskFailure, in_child
 from smust3r_colmap.features.covisibility import SeenSurface, select_pairs
+from smust3r_colmap.features.guided_verification import read_matched_features
+from smust3r_colmap.features.pose_readings import AS_COLMAP, agreement, best_reading
 from smust3r_colmap.features.seen_surfaces import seen_surfaces, surfaces_of_clouds, surfaces_of_maps
 from smust3r_colmap.features.stage import features_of_run, match_pairs_of_run
 from smust3r_colmap.geometry.arrays import FloatArray, Pair
@@ -216,26 +218,39 @@ def refine_external(
     options: TrackConfig,
     feature_options: FeatureConfig,
 ) -> Refinement:
-    """As ``refine``, with a warning if the poses may follow another convention than COLMAP's.
+    """As ``refine``, for a model that may mean something else by its poses than COLMAP does.
 
-    Such poses look like any others, but few matches agree with them.
+    Such poses look like any others, but few matches agree with them, and nothing that follows from them is a result.
+
+    Raises:
+        InputError: the matches of most image pairs contradict the poses; it names the reading that they agree with.
     """
     refinement = refine(run, initial, collection, features, RefinementConfig(**vars(options)), feature_options)
     assert refinement is not None, "switched on"
-    (result,) = refinement.results
-    if result.succeeded and result.num_unverified_pairs <= result.num_pairs:
+    (result,), (scene,) = refinement.results, initial.scenes
+    if result.num_unverified_pairs <= result.num_pairs:
         return refinement
-    warning = (
-        f"the matches of {result.num_pairs} image pairs agree with the poses, those of {result.num_unverified_pairs} "
-        "do not; has the model camera centres in place of translations, or poses from camera to world? COLMAP's are "
-        "from world to camera"
+    agreeing = agreement(
+        read_matched_features(features.database, scene.image_indices),
+        dict(zip(scene.image_indices, scene.cam_from_world, strict=True)),
+        {i: scene.cameras[camera] for i, camera in zip(scene.image_indices, scene.camera_indices, strict=True)},
+        tolerance=initial.tolerance,
     )
-    warned = (
-        replace(result, warnings=(*result.warnings, warning))
-        if result.succeeded
-        else replace(result, reason=f"{result.reason}; {warning}")
+    best = best_reading(agreeing)
+    if best is None or best == AS_COLMAP:
+        hint = (
+            "nor with the poses read in any other usual way. Are these the images of the model, and its focal lengths "
+            "in pixels of the full image?"
+        )
+    else:
+        hint = (
+            f"but {agreeing[best]:.0%} of all matches do if the model has {best}. Write the poses as COLMAP's: from "
+            "world to camera, axes x right, y down, z forward, and quaternions QW QX QY QZ"
+        )
+    raise InputError(
+        f"the matches of {result.num_pairs} image pairs agree with the poses of the model and those of "
+        f"{result.num_unverified_pairs} do not, so no result is written; {hint}"
     )
-    return replace(refinement, results=(warned,))
 
 
 def _match(run: Run, seen: Sequence[Sequence[SeenSurface]], features: RunFeatures, per_image: int) -> tuple[Pair, ...]:

@@ -206,12 +206,14 @@ def _image(cursor: _Cursor) -> tuple[int, tuple[float, ...], int, str, Any]:
 def _rig(cursor: _Cursor) -> Rig:
     rig_id, num_sensors = cursor.take("II")
     sensors = [cursor.take("iI")] if num_sensors else []
+    poses = {}
     for _ in range(1, num_sensors):
-        *sensor, has_pose = cursor.take("iIB")
+        kind, sensor_id, has_pose = cursor.take("iIB")
+        sensors.append((kind, sensor_id))
         if has_pose:
-            cursor.take("7d")
-        sensors.append(tuple(sensor))
-    return Rig(rig_id=rig_id, sensors=tuple((kind, sensor_id) for kind, sensor_id in sensors))
+            poses[kind, sensor_id] = cursor.take("7d")
+    named = tuple((kind, sensor_id) for kind, sensor_id in sensors)
+    return Rig(rig_id=rig_id, sensors=named, sensor_from_rig=poses)
 
 
 def _frame(cursor: _Cursor) -> Frame:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from smust3r_colmap.importers.intrinsics_units import FOCAL_RATIO_RANGE, rescaling
 from smust3r_colmap.validation.description import CAMERA_MODELS, Camera, Subject
 from smust3r_colmap.validation.rules import Evidence, Rule, Severity, measured, offenders, rule
 
@@ -12,11 +13,6 @@ _UNDISTORT = (
 
 _OFF_CENTRE_PX = 1.0
 """Below, leaving the principal point out shifts a picture by less than its pixels."""
-
-_MIN_RESCALING = 0.15
-_RESCALING_TOLERANCE = 0.03
-"""A principal point off by 15 % of the centre, and by the same factor in x and y, is one of another resolution:
-crops move it in one direction, and real lenses are off by a few percent."""
 
 _FOCAL_RATIO_RANGE = (0.1, 10.0)
 """Focal length over the longer side; the limits of COLMAP's mapper (min_focal_length_ratio and its counterpart)."""
@@ -178,8 +174,39 @@ def _scaled(camera: Camera) -> bool:
     point = camera.principal_point
     if point is None or camera.width <= 0 or camera.height <= 0:
         return False
-    x, y = 2 * point[0] / camera.width, 2 * point[1] / camera.height
-    return min(abs(x - 1), abs(y - 1)) > _MIN_RESCALING and abs(x - y) < _RESCALING_TOLERANCE * max(abs(x), abs(y))
+    return rescaling(*point, camera.width, camera.height) is not None
+
+
+@rule(
+    "principal-point-zero",
+    "the principal point is the corner of the image",
+    severity=Severity.REFUSED,
+    advice="write the middle of the image, where nothing better is known (`smust3r-colmap refine` does)",
+)
+def _principal_point_zero(subject: Subject) -> Evidence | None:
+    found = [f"camera {camera.camera_id}" for camera in subject.model.cameras if camera.principal_point == (0, 0)]
+    return _cameras(subject, found)
+
+
+@rule(
+    "focal-impossible",
+    "a focal length that cannot be one",
+    severity=Severity.REFUSED,
+    advice="leave out the images of this camera, or give it the focal length of the others: it was never estimated, or "
+    "another number stands in its place",
+)
+def _focal_impossible(subject: Subject) -> Evidence | None:
+    found = [
+        f"camera {camera.camera_id}: {value:g} px"
+        for camera in subject.model.cameras
+        for value in camera.focal
+        if _is_impossible(camera, value)
+    ]
+    return _cameras(subject, found)
+
+
+def _is_impossible(camera: Camera, focal: float) -> bool:
+    return focal <= 0 or focal > FOCAL_RATIO_RANGE[1] * max(camera.width, camera.height, 1)
 
 
 @rule(
@@ -192,9 +219,8 @@ def _focal_absurd(subject: Subject) -> Evidence | None:
     found = []
     for camera in subject.model.cameras:
         side = max(camera.width, camera.height)
-        if side > 0 and any(
-            not _FOCAL_RATIO_RANGE[0] <= focal / side <= _FOCAL_RATIO_RANGE[1] for focal in camera.focal
-        ):
+        possible = [focal for focal in camera.focal if not _is_impossible(camera, focal)]
+        if side > 0 and any(not _FOCAL_RATIO_RANGE[0] <= focal / side <= _FOCAL_RATIO_RANGE[1] for focal in possible):
             found.append(f"camera {camera.camera_id}: {camera.focal[0]:g} px for {camera.width} x {camera.height}")
     return _cameras(subject, found)
 
@@ -208,7 +234,7 @@ def _focal_absurd(subject: Subject) -> Evidence | None:
 def _focal_unequal(subject: Subject) -> Evidence | None:
     found = []
     for camera in subject.model.cameras:
-        if len(camera.focal) == 2 and camera.focal[1] != 0:
+        if len(camera.focal) == 2 and not any(_is_impossible(camera, focal) for focal in camera.focal):
             ratio = camera.focal[0] / camera.focal[1]
             if not _FOCAL_ASPECT_RANGE[0] <= ratio <= _FOCAL_ASPECT_RANGE[1]:
                 found.append(f"camera {camera.camera_id}: fx / fy = {ratio:.2f}")
@@ -249,6 +275,8 @@ RULES = (
     _size_zero,
     _off_centre,
     _other_resolution,
+    _principal_point_zero,
+    _focal_impossible,
     _focal_absurd,
     _focal_unequal,
     _distortion_absurd,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from smust3r_colmap.geometry.arrays import BoolArray, FloatArray, IntArray
-from smust3r_colmap.validation.description import Frame, Subject
+from smust3r_colmap.importers.rig_poses import Pose, composed, is_same_pose
+from smust3r_colmap.validation.description import Frame, Rig, Subject
 from smust3r_colmap.validation.rules import Evidence, Severity, measured, offenders, rule
 
 _HIGH_ERROR_PX = 2.0
@@ -20,8 +21,8 @@ _LARGE_COORDINATE = 1e5
 """Single precision then has steps of a centimetre, if the unit is a metre."""
 
 _QUATERNION_LENGTH_TOLERANCE = 1e-3
-_POSE_TOLERANCE = 1e-6
-"""Relative, between the pose of a frame and that of its image; both are written from one number."""
+_MAX_QUATERNION_LENGTH_ERROR = 0.1
+"""Beyond that it is no rotation written carelessly, but other numbers."""
 
 
 @rule(
@@ -42,8 +43,24 @@ def _pose_not_finite(subject: Subject) -> Evidence | None:
 )
 def _quaternion(subject: Subject) -> Evidence | None:
     images = subject.model.images
+    error = np.abs(np.linalg.norm(images.quat_wxyz, axis=1) - 1)
+    careless = (error > _QUATERNION_LENGTH_TOLERANCE) & (error <= _MAX_QUATERNION_LENGTH_ERROR)
+    return _images(subject, images.finite & careless)
+
+
+@rule(
+    "pose-quaternion-none",
+    "quaternions that are no rotation",
+    severity=Severity.REFUSED,
+    advice="columns are IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME: were translation and quaternion swapped, or is a "
+    "column missing?",
+)
+def _no_quaternion(subject: Subject) -> Evidence | None:
+    images = subject.model.images
     length = np.linalg.norm(images.quat_wxyz, axis=1)
-    return _images(subject, images.finite & (np.abs(length - 1) > _QUATERNION_LENGTH_TOLERANCE))
+    wrong = np.flatnonzero(images.finite & (np.abs(length - 1) > _MAX_QUATERNION_LENGTH_ERROR))
+    found = [f"{images.names[index]!r}: length {length[index]:.4g}, needed is 1" for index in wrong]
+    return offenders(found, of=len(images), unit="images")
 
 
 @rule(
@@ -239,29 +256,31 @@ def _frame_dangling(subject: Subject) -> Evidence | None:
     advice="COLMAP takes the frame's pose, every other program the image's; delete rigs and frames, or correct one",
 )
 def _frame_pose(subject: Subject) -> Evidence | None:
-    frames, rigs = subject.model.frames or (), subject.model.rigs or ()
-    trivial = {rig.rig_id for rig in rigs if len(rig.sensors) == 1}
-    index_by_id = {image_id: index for index, image_id in enumerate(subject.model.images.ids.tolist())}
-    found = [
-        f"frame {frame.frame_id}"
-        for frame in frames
-        if frame.rig_id in trivial
-        and len(frame.image_ids) == 1
-        and frame.image_ids[0] in index_by_id
-        and _differs(subject, index_by_id[frame.image_ids[0]], frame)
-    ]
-    return offenders(found, of=len(frames), unit="frames")
-
-
-def _differs(subject: Subject, index: int, frame: Frame) -> bool:
-    """A quaternion and its negative are the same rotation."""
+    rigs = {rig.rig_id: rig for rig in subject.model.rigs or ()}
     images = subject.model.images
-    quat, other = images.quat_wxyz[index], np.array(frame.quat_wxyz)
-    translation = images.translation[index]
-    scale = max(1.0, float(np.abs(translation).max()))
-    moved = float(np.abs(translation - frame.translation).max()) > _POSE_TOLERANCE * scale
-    turned = min(np.abs(quat - other).max(), np.abs(quat + other).max()) > _POSE_TOLERANCE
-    return bool(moved or turned)
+    index_by_id = {image_id: index for index, image_id in enumerate(images.ids.tolist())}
+    found, num_compared = [], 0
+    for frame in subject.model.frames or ():
+        for kind, sensor_id, image_id in frame.data:
+            pose = _by_frame(rigs.get(frame.rig_id), (kind, sensor_id), frame)
+            index = index_by_id.get(image_id)
+            if pose is None or index is None or kind != 0 or not images.finite[index]:
+                continue
+            num_compared += 1
+            if not is_same_pose((*images.quat_wxyz[index].tolist(), *images.translation[index].tolist()), pose):
+                found.append(f"{images.names[index]!r} in frame {frame.frame_id}")
+    return offenders(found, of=num_compared, unit="images in frames")
+
+
+def _by_frame(rig: Rig | None, sensor: tuple[int, int], frame: Frame) -> Pose | None:
+    """sensor_from_world; None where the rig is not there, or does not say where the sensor is."""
+    rig_from_world = (*frame.quat_wxyz, *frame.translation)
+    if rig is None or not rig.sensors:
+        return None
+    if sensor == rig.sensors[0]:
+        return rig_from_world
+    pose = rig.sensor_from_rig.get(sensor)
+    return None if pose is None else composed(pose, rig_from_world)
 
 
 def _images(subject: Subject, wrong: BoolArray) -> Evidence | None:
@@ -282,6 +301,7 @@ def _points(subject: Subject, wrong: BoolArray) -> Evidence | None:
 RULES = (
     _pose_not_finite,
     _quaternion,
+    _no_quaternion,
     _camera_not_finite,
     _point_not_finite,
     _observation_not_finite,

@@ -194,10 +194,14 @@ class Points:
 
 @dataclass(frozen=True, kw_only=True)
 class Rig:
-    """``sensors`` are (kind, id), the reference first; kind 0 is a camera."""
+    """``sensors`` are (kind, id), the reference first; kind 0 is a camera.
+
+    ``sensor_from_rig`` are quaternion and translation of those that have a pose, by (kind, id); the reference has none.
+    """
 
     rig_id: int
     sensors: tuple[tuple[int, int], ...]
+    sensor_from_rig: Mapping[tuple[int, int], tuple[float, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -300,13 +300,12 @@ def _is_id(number: int) -> bool:
 
 def _rig(fields: list[str]) -> Rig:
     rest = iter(fields[2:])
-    sensors = []
+    sensors, poses = [], {}
     for number in range(int(fields[1])):
         sensors.append((_sensor_kind(_next(rest)), int(_next(rest))))
         if number > 0 and int(_next(rest)):  # the reference sensor has no pose, others may have one
-            for _ in range(7):
-                float(_next(rest))
-    return Rig(rig_id=int(fields[0]), sensors=tuple(sensors))
+            poses[sensors[-1]] = tuple(float(_next(rest)) for _ in range(7))
+    return Rig(rig_id=int(fields[0]), sensors=tuple(sensors), sensor_from_rig=poses)
 
 
 def _frame(fields: list[str]) -> Frame:

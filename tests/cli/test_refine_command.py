@@ -254,7 +254,9 @@ def test_a_model_without_points_is_refined_as_well(export: Export, result: RunSu
     assert export.error_of(tmp_path / "out/sparse/0").position_rmse < before.position_rmse / 3
 
 
-def test_poses_that_no_match_agrees_with_are_doubted_aloud(export: Export, result: RunSummary, tmp_path: Path) -> None:
+def test_poses_of_another_meaning_are_named_and_nothing_is_written(
+    export: Export, result: RunSummary, tmp_path: Path
+) -> None:
     """Camera centres where translations belong: the file looks as good as any."""
     model = tmp_path / "export"
     shutil.copytree(export.model, model)
@@ -264,9 +266,9 @@ def test_poses_that_no_match_agrees_with_are_doubted_aloud(export: Export, resul
     (model / "images.txt").write_text("".join(f"{' '.join(words)}\n" for words in lines))
     shutil.copytree(result.output / "work/features", tmp_path / "out/work/features")
     (tmp_path / "out/work/lock").touch()
-    summary = refined(replace(command(export, tmp_path / "out"), model=model))
-    assert summary.exit_code == 3
-    assert any("camera centres in place of translations" in reason for reason in summary.weak_reasons)
+    with pytest.raises(InputError, match="of all matches do if the model has camera centres in place of translations"):
+        refined(replace(command(export, tmp_path / "out"), model=model))
+    assert not (tmp_path / "out/sparse").exists()
 
 
 def test_photographs_without_a_feature_leave_the_model_as_it_was(export: Export, tmp_path: Path) -> None:

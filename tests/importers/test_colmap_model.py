@@ -230,6 +230,10 @@ def edited(index: int, old: str, new: str) -> Callable[[Text], Text]:
         (edited(-1, "200 100", "0 100"), r"line 2: camera 1 cannot be used: .*0x100 is empty"),
         (edited(-1, "150 150", "nan 150"), r"line 2: camera 1 cannot be used: .*not finite"),
         (edited(-1, "150 150", "-150 150"), r"line 2: camera 1 has focal length -150; it must be positive"),
+        (edited(-1, "150 150", "1e308 150"), r"line 2: camera 1 has focal length 1e\+308 px, for 200x100 px; no lens"),
+        (edited(-1, "150 150", "9 9"), r"focal length 9 px.* in millimetres \(50 px if .* 36 mm wide\)"),
+        (edited(-1, "PINHOLE 200 100 150 150 100 50", "EQUIRECTANGULAR 200 100 200 100"), r"line 2: .* is EQUIRECT"),
+        (edited(-1, "PINHOLE 200 100 150 150 100 50", "EUCM 200 100 150 150 100 50 0.6 1.05"), r"line 2: .* is EUCM"),
         (edited(-1, " 200 100 150 150 100 50", ""), r"cameras.txt: line 2: 2 words; a camera has"),
     ],
 )

@@ -48,6 +48,8 @@ FROM_BARE: dict[str, Case] = {
     ),
     "principal-point-off-centre": (lambda bare: with_camera(bare, params=(300.0, 300.0, CX + 1.5, CY)), set()),
     "intrinsics-other-resolution": (camera_params(150.0, 150.0, CX / 2, CY / 2), UNOBSERVED),
+    "principal-point-zero": (camera_params(300.0, 300.0, 0.0, 0.0), {*UNOBSERVED, "principal-point-off-centre"}),
+    "focal-impossible": (camera_params(300.0, -500.0, CX, CY), UNOBSERVED),
     "focal-absurd": (camera_params(20.0, 20.0, CX, CY), UNOBSERVED),
     "focal-unequal": (camera_params(300.0, 250.0, CX, CY), UNOBSERVED),
     "distortion-absurd": (

@@ -49,6 +49,10 @@ FROM_BARE: dict[str, Case] = {
         lambda bare: with_images(without_frames(bare), quat_wxyz=bare.model.images.quat_wxyz * 1.01),
         set(),
     ),
+    "pose-quaternion-none": (
+        lambda bare: with_images(without_frames(bare), quat_wxyz=bare.model.images.quat_wxyz * 10),
+        set(),
+    ),
     "coordinates-large": (shifted_world(1e6), set()),
     "outlier-cameras": (far_camera, {"image-unobserved"}),
     "outlier-points": (outlier_point, {"track-none"}),
@@ -72,3 +76,19 @@ def test_every_rule_of_the_module_is_in_its_tuple_and_has_a_case() -> None:
 
     assert set(rules) <= set(checks_geometry.RULES)
     assert {rule.name for rule in checks_geometry.RULES} == set(FROM_BARE)
+
+
+@pytest.mark.parametrize(
+    ("sensor_from_rig", "differs"), [((1.0, 0, 0, 0, 0, 0, 0), False), ((1.0, 0, 0, 0, 0.5, 0, 0), True)]
+)
+def test_frames_of_rigs_with_several_sensors_are_compared_with_their_images(
+    bare: Subject, sensor_from_rig: tuple[float, ...], differs: bool
+) -> None:
+    """The camera of the images is the second sensor, in the place of the first or half a unit beside it."""
+    rigs = tuple(
+        Rig(rig_id=rig.rig_id, sensors=((0, 9), *rig.sensors), sensor_from_rig={rig.sensors[0]: sensor_from_rig})
+        for rig in bare.model.rigs or ()
+    )
+
+    assert rigs
+    assert ("frame-pose-differs" in found_in(with_model(bare, rigs=rigs))) == differs
