@@ -20,10 +20,9 @@ The next module to read is ``mesh``.
 
 from __future__ import annotations
 
-import io
 import logging
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
@@ -39,7 +38,7 @@ from smust3r_colmap.errors import ImageError, InputError, ReconstructionError, S
 from smust3r_colmap.execution.task_pool import TaskFailure, in_child, usable_cores
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.geometry.depth_noise import VIEW_AGREEMENT
-from smust3r_colmap.importers.images import inspect, load_rgb, stored_orientation
+from smust3r_colmap.importers.images import inspect, load_rgb, open_image, stored_orientation
 from smust3r_colmap.products import DepthMaps, SourceImage
 from smust3r_colmap.storage.atomic_write import atomic_folder
 
@@ -100,6 +99,7 @@ def write_dense_workspace(
     maps: DepthMaps,
     folder: Path,
     *,
+    bits: Mapping[str, int] | None = None,
     memory_gib: float = 2.0,
     log_file: Path | None = None,
 ) -> DenseReport:
@@ -111,6 +111,7 @@ def write_dense_workspace(
         images: folder of the original images.
         maps: depth by the names of the model's images.
         folder: written atomically.
+        bits: by name, that images with more than 8 bits a channel are scaled by.
         memory_gib: maps that fusion holds in memory; larger workspaces are read submodel by submodel.
         log_file: for the messages of native code.
 
@@ -122,7 +123,7 @@ def write_dense_workspace(
         StorageError: the disk refused.
     """
     original = _read(model)
-    sources = [_look_at(images, original, i) for i in sorted(original.reg_image_ids())]
+    sources = [_look_at(images, original, i, bits or {}) for i in sorted(original.reg_image_ids())]
     with_map = [source for source in sources if source.name in maps]
     if not with_map:
         raise InputError(f"no depth map for any of the {len(sources)} images of the model; make maps first")
@@ -165,15 +166,17 @@ class _Source:
         image_id, name: in the model.
         workspace_name: in the workspace; another where COLMAP could not read the file under its old one.
         as_copy: COLMAP would read the pixels wrongly or not at all, so it gets a copy of them.
+        bits: as in ``SourceImage``.
     """
 
     image_id: int
     name: str
     workspace_name: str
     as_copy: bool
+    bits: int | None = None
 
 
-def _look_at(images: Path, model: pycolmap.Reconstruction, image_id: int) -> _Source:
+def _look_at(images: Path, model: pycolmap.Reconstruction, image_id: int, bits: Mapping[str, int]) -> _Source:
     """Decode a file and compare it with its camera.
 
     Raises:
@@ -193,24 +196,29 @@ def _look_at(images: Path, model: pycolmap.Reconstruction, image_id: int) -> _So
         raise ImageError(f"{name}: cannot be read: {error.strerror}") from error
     except ImageError as error:
         raise ImageError(f"{name}: {error}") from error
-    if (photo.width, photo.height) != (camera.width, camera.height):
+    upright = (photo.width, photo.height) == (camera.width, camera.height)
+    if not upright and photo.stored_size != (camera.width, camera.height):
         raise ImageError(
             f"{name}: the file is {photo.width}x{photo.height} px and its camera {camera.width}x{camera.height};"
             " give the images that the model was made of"
         )
-    unreadable = data.startswith(b"RIFF")  # COLMAP knows no WebP.
+    unreadable = not data.startswith(_KNOWN_TO_COLMAP)
     return _Source(
         image_id=image_id,
         name=name,
         workspace_name=f"{name}.png" if unreadable else name,
-        as_copy=unreadable or _is_turned(data),
+        as_copy=unreadable or photo.deep or (upright and _is_turned(data)),
+        bits=bits.get(name),
     )
+
+
+_KNOWN_TO_COLMAP = (b"\xff\xd8\xff", b"\x89PNG", b"II*\0", b"MM\0*", b"BM")
+"""First bytes of JPEG, PNG, TIFF and BMP."""
 
 
 def _is_turned(data: bytes) -> bool:
     """EXIF says that the pixels are stored turned or mirrored. COLMAP ignores that."""
-    with Image.open(io.BytesIO(data)) as head:
-        return stored_orientation(head) != 1
+    return stored_orientation(open_image(data)) != 1
 
 
 def _longer_side(model: pycolmap.Reconstruction, maps: DepthMaps) -> int:
@@ -287,6 +295,7 @@ def _lay_out(model: pycolmap.Reconstruction, images: Path, sources: Sequence[_So
             height=camera.height,
             camera=0,
             digest="",
+            bits=source.bits,
         )
         Image.fromarray(load_rgb(file)).save(place, quality=_COPY_JPEG_QUALITY)
     renamed.write_binary(inputs / "model")

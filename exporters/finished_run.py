@@ -13,7 +13,7 @@ from pathlib import Path
 from smust3r_colmap.colmap.model_files import MODEL_FILES
 from smust3r_colmap.errors import CollectionError, ImageError, InputError, RunDirectoryError
 from smust3r_colmap.execution.run_context import Run
-from smust3r_colmap.importers.image_folder import FolderScan, ImportRecord
+from smust3r_colmap.importers.image_folder import FolderScan, ImportRecord, bits_in_use
 from smust3r_colmap.importers.image_scan import RECORDS, is_of_another_version, store_scan
 from smust3r_colmap.importers.masks import MaskSet, check_masks
 from smust3r_colmap.products import DepthMaps, Scene
@@ -66,6 +66,7 @@ class FinishedRun:
         maps: depth of the images, or None.
         masks: those that the run was made with, or None.
         timestamps_s: capture times of the images that have one, by name.
+        bits: that images with more than 8 bits a channel are scaled by, by name.
     """
 
     output: Path
@@ -77,6 +78,7 @@ class FinishedRun:
     maps: DepthMaps | None
     masks: MaskSet | None = None
     timestamps_s: Mapping[str, float] = field(default_factory=dict)
+    bits: Mapping[str, int] = field(default_factory=dict)
 
     def sparse_model(self, number: int) -> Path:
         """Where the COLMAP model number ``number`` goes."""
@@ -156,6 +158,7 @@ def open_finished(run: RunDirectory, *, images: Path | None = None, output: Path
         maps=StoredDepthMaps(run.work / STITCHED_STAGE) if parts.with_maps else None,
         masks=parts.masks,
         timestamps_s=parts.timestamps_s,
+        bits=bits_in_use(RECORDS.read(run.work / IMPORT_STAGE)),
     )
 
 

@@ -117,6 +117,7 @@ def export(
         maps=initial.maps,
         masks=masks_of(collection, config.masks),
         timestamps_s={one.name: one.timestamp_s for one in collection.images if one.timestamp_s is not None},
+        bits={image.name: image.bits for image in collection.images if image.bits is not None},
     )
     settings = FormatSettings.of(config.output)
     with run.clock.stage("export", total=1) as progress:
@@ -212,6 +213,7 @@ def write_trainer(finished: FinishedRun, settings: FormatSettings) -> Written:
         cloud=finished.scenes[0].points,
         scales=settings.trainer_scales,
         masks=settings.masks or (None if finished.masks is None else finished.masks.folder),
+        bits=finished.bits,
         keep_outliers=settings.keep_outliers,
     )
     left_out = report.left_out
@@ -238,6 +240,7 @@ def write_dense(finished: FinishedRun, settings: FormatSettings) -> Written:
         finished.images,
         finished.maps,
         finished.output / DENSE_FOLDER,
+        bits=finished.bits,
         log_file=finished.native_log,
     )
     notes = []

@@ -98,6 +98,7 @@ def write_training_dataset(
     cloud: PointCloud | None,
     scales: tuple[int, ...] = (),
     masks: Path | None = None,
+    bits: Mapping[str, int] | None = None,
     keep_outliers: bool = False,
 ) -> TrainingReport:
     """Write ``folder``, or replace what an earlier call has written there.
@@ -110,7 +111,9 @@ def write_training_dataset(
         cloud: in the world of the model, lends its normals to the points; those it does not reach, and all
             without it, face their cameras.
         scales: such as (2, 4, 8) for ``images_2``, ``images_4`` and ``images_8``.
-        masks: a folder with a mask for each image, named as COLMAP wants it.
+        masks: a folder with a mask for each image, named as COLMAP wants it; where an image has none, its alpha is it.
+        bits: by name, that images with more than 8 bits a channel are scaled by; by default each by its own brightest
+            pixel.
         keep_outliers: keep cameras and points that lie far from all others.
 
     Raises:
@@ -121,7 +124,7 @@ def write_training_dataset(
     """
     cameras = {camera_id: CentredPinhole.of(model.camera(camera_id)) for camera_id in _used_cameras(model)}
     selection = select_for_training(model, cameras, keep_outliers=keep_outliers)
-    sources = _look_at_images(model, images, selection, cameras)
+    sources = _look_at_images(model, images, selection, cameras, bits or {})
     check_scales(scales, list(sources.values()))
     if masks is not None and not masks.is_dir():
         raise InputError(f"{masks}: there is no such folder of masks")
@@ -132,14 +135,15 @@ def write_training_dataset(
 
     with atomic_folder(folder, may_hold=_ours_in(folder)) as partial:
         write_images(pixels, partial, scales)
-        without_mask = () if masks is None else write_masks(pixels, masks, partial, scales)
+        has_masks = masks is not None or any(source.transparent for source in sources.values())
+        without_mask = write_masks(pixels, masks, partial, scales) if has_masks else ()
         sparse = partial / "sparse" / "0"
         sparse.mkdir(parents=True)
         write_binary_checked(pinholes, sparse, to_be=folder / "sparse" / "0")
         write_ply(points, sparse / "points3D.ply")
         scale = common_scale(selection.observations.depth)
         without_depth = () if maps is None else _write_depths(model, pinholes, maps, scale, partial)
-        mask_of = None if masks is None else {name: f"masks/{_stem(name)}.png" for name in names.values()}
+        mask_of = None if not has_masks else {name: f"masks/{_stem(name)}.png" for name in names.values()}
         _write_json(transforms_json(pinholes, mask_of=mask_of), partial / "transforms.json")
         write_ply(points_saved(points), partial / "sparse_pc.ply")
         _write_json(names, partial / "names.json")
@@ -170,7 +174,11 @@ def _used_cameras(model: pycolmap.Reconstruction) -> list[int]:
 
 
 def _look_at_images(
-    model: pycolmap.Reconstruction, images: Path, selection: Selection, cameras: Mapping[int, CentredPinhole]
+    model: pycolmap.Reconstruction,
+    images: Path,
+    selection: Selection,
+    cameras: Mapping[int, CentredPinhole],
+    bits: Mapping[str, int],
 ) -> dict[int, TrainingImage]:
     """By image id, the files of the selected images, all looked at before anything is written."""
     sources: dict[int, TrainingImage] = {}
@@ -180,7 +188,7 @@ def _look_at_images(
         if name in id_of:
             raise InputError(f"{name}: images {id_of[name]} and {i} of the model have this name; one file is one image")
         id_of[name] = i
-        sources[i] = look_at_image(images, name, cameras[model.image(i).camera_id])
+        sources[i] = look_at_image(images, name, cameras[model.image(i).camera_id], bits=bits.get(name))
     return sources
 
 

@@ -9,7 +9,6 @@ become RGB: gsplat and the original 3D Gaussian Splatting expect three channels.
 from __future__ import annotations
 
 import shutil
-import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -20,13 +19,12 @@ from pathlib import Path, PurePosixPath
 import cv2
 import numpy as np
 import numpy.typing as npt
-from PIL import Image, UnidentifiedImageError
 
 from smust3r_colmap.errors import ImageError, InputError
 from smust3r_colmap.execution.task_pool import usable_cores
 from smust3r_colmap.exporters.centred_pinhole import CentredPinhole, resampled
 from smust3r_colmap.geometry.arrays import UInt8Array
-from smust3r_colmap.importers.images import TURNED_SIDEWAYS, load_rgb, orientation_to_apply
+from smust3r_colmap.importers.images import TURNED_SIDEWAYS, load_alpha, load_rgb, look_at_head
 from smust3r_colmap.importers.masks import find_mask, load_mask
 from smust3r_colmap.products import SourceImage
 
@@ -43,7 +41,6 @@ IMAGES_PER_LOOKUP = 16
 """Images that one thread takes at a time; they share the lookup of their camera."""
 
 _Lookup = npt.NDArray[np.float32] | None
-_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,17 +52,22 @@ class TrainingImage:
         suffix: of the new file, ``.jpg`` or ``.png``.
         camera: of the file, and the pinhole that replaces it.
         verbatim: the file is copied as it is.
+        transparent: some of its pixels are.
     """
 
     source: SourceImage
     suffix: str
     camera: CentredPinhole
     verbatim: bool
+    transparent: bool = False
 
 
 # ----------------------------------------------------------------------------- looking
-def look_at_image(images: Path, name: str, camera: CentredPinhole) -> TrainingImage:
+def look_at_image(images: Path, name: str, camera: CentredPinhole, *, bits: int | None = None) -> TrainingImage:
     """Read the head of an image file and compare it with its camera.
+
+    Args:
+        bits: as in ``SourceImage``.
 
     Raises:
         ImageError: there is no such file, it is no image, or it has another size than the camera.
@@ -73,31 +75,30 @@ def look_at_image(images: Path, name: str, camera: CentredPinhole) -> TrainingIm
     path = images / name
     width, height = camera.original.width, camera.original.height
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # Orthophotos are that large.
-            with Image.open(path, formats=_FORMATS) as head:
-                kind, size, mode = head.format, head.size, head.mode
-                turn = orientation_to_apply(head)
-        with path.open("rb") as file:
-            bit_depth = file.read(25)[24]  # PNG 11.2.1: signature 8, chunk head 8, width 4, height 4, bit depth.
+        head = look_at_head(path.read_bytes())
     except FileNotFoundError as error:
         raise ImageError(f"{name}: there is no such file in {images}; give the folder the model was made of") from error
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, IndexError) as error:
+    except OSError as error:
+        raise ImageError(f"{name}: cannot be read ({error.strerror})") from error
+    except ImageError as error:
         raise ImageError(f"{name}: cannot be read as JPEG, PNG, WebP or TIFF ({error})") from error
-    sideways = turn in TURNED_SIDEWAYS
-    upright = size[::-1] if sideways else size
+    size, sideways = head.size, head.orientation in TURNED_SIDEWAYS
+    upright = size if size == (width, height) or not sideways else size[::-1]
     if upright != (width, height):
         turned = f" (stored as {size[0]}x{size[1]}, turned by its EXIF orientation)" if sideways else ""
         raise ImageError(
             f"{name}: the file is {upright[0]}x{upright[1]} px{turned} and its camera {width}x{height};"
             " give the images that the model was made of"
         )
-    plain = kind == "JPEG" or (kind == "PNG" and bit_depth == 8)
+    source = SourceImage(name=name, path=path, width=width, height=height, camera=0, digest="", bits=bits)
+    plain = head.kind in ("JPEG", "PNG") and head.mode == "RGB" and not head.deep and head.orientation == 1
+    alpha = load_alpha(source) if head.has_alpha else None
     return TrainingImage(
-        source=SourceImage(name=name, path=path, width=width, height=height, camera=0, digest=""),
-        suffix=".jpg" if kind in ("JPEG", "MPO") else ".png",  # MPO: JPEG of phones with a second image behind
+        source=source,
+        suffix=".jpg" if head.kind in ("JPEG", "MPO") else ".png",
         camera=camera,
-        verbatim=plain and mode == "RGB" and turn == 1 and camera.is_identity,
+        verbatim=plain and camera.is_identity,
+        transparent=alpha is not None and bool((alpha == 0).any()),
     )
 
 
@@ -121,12 +122,13 @@ def write_images(images: Sequence[tuple[TrainingImage, str]], folder: Path, scal
 
 
 def write_masks(
-    images: Sequence[tuple[TrainingImage, str]], masks: Path, folder: Path, scales: Sequence[int]
+    images: Sequence[tuple[TrainingImage, str]], masks: Path | None, folder: Path, scales: Sequence[int]
 ) -> tuple[str, ...]:
     """Write the masks below ``folder`` in both naming rules, for nerfstudio and Brush, and for COLMAP.
 
     ``masks/<new stem>.png`` and ``masks/<new name>.png`` are the same; white is kept. What is not black in the
-    original is kept, as in COLMAP. An image without a mask gets a white one: nerfstudio wants all or none.
+    original is kept, as in COLMAP. An image without a mask file gets that of its alpha, else a white one:
+    nerfstudio wants all or none.
 
     Returns:
         Names in the model of the images without a mask.
@@ -137,7 +139,8 @@ def write_masks(
     """
     _make_folders(folder, "masks", scales)
     _each_camera_at_once(images, partial(_write_mask, masks, folder, scales))
-    return tuple(image.source.name for image, _ in images if find_mask(masks, image.source.name) is None)
+    whole = [image for image, _ in images if not image.transparent and _mask_file(masks, image) is None]
+    return tuple(image.source.name for image in whole)
 
 
 def encoded(suffix: str, pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> bytes:
@@ -186,7 +189,7 @@ def _write_image(folder: Path, scales: Sequence[int], image: TrainingImage, name
 
 
 def _write_mask(
-    masks: Path,
+    masks: Path | None,
     folder: Path,
     scales: Sequence[int],
     image: TrainingImage,
@@ -205,12 +208,17 @@ def _write_mask(
             (folder / below / mask_name).write_bytes(content)
 
 
-def _kept(masks: Path, image: TrainingImage) -> UInt8Array:
+def _kept(masks: Path | None, image: TrainingImage) -> UInt8Array:
     """(H, W) of the original image, 255 where it is kept."""
-    path = find_mask(masks, image.source.name)
-    if path is None:
-        return np.full((image.source.height, image.source.width), 255, np.uint8)
-    return load_mask(path, image.source)
+    path = _mask_file(masks, image)
+    if path is not None:
+        return load_mask(path, image.source)
+    alpha = load_alpha(image.source) if image.transparent else None
+    return np.full((image.source.height, image.source.width), 255, np.uint8) if alpha is None else alpha
+
+
+def _mask_file(masks: Path | None, image: TrainingImage) -> Path | None:
+    return None if masks is None else find_mask(masks, image.source.name)
 
 
 def _smaller(pixels: UInt8Array, scale: int, how: int) -> UInt8Array:

@@ -40,6 +40,7 @@ class CameraTags:
         focal_mm: focal length of the lens.
         focal_35mm: focal length of equal diagonal field of view on 35 mm film.
         sensor_mm: longer side of the sensor, from the focal plane resolution.
+        digital_zoom: the image is a crop of the sensor, enlarged by this; focal lengths do not say so.
     """
 
     make: str = ""
@@ -47,6 +48,7 @@ class CameraTags:
     focal_mm: float | None = None
     focal_35mm: float | None = None
     sensor_mm: float | None = None
+    digital_zoom: float | None = None
 
 
 def read_camera_tags(exif: Image.Exif) -> CameraTags:
@@ -64,6 +66,7 @@ def read_camera_tags(exif: Image.Exif) -> CameraTags:
             # EXIF 2.3, 4.6.5: the unit is inches where the tag is missing.
             unit=details.get(ExifTags.Base.FocalPlaneResolutionUnit, 2),
         ),
+        digital_zoom=_positive(details.get(ExifTags.Base.DigitalZoomRatio)),
     )
 
 
@@ -71,8 +74,8 @@ def focal_prior_px(tags: CameraTags, width: int, height: int) -> float | None:
     """Focal length in pixels of an image of ``width`` x ``height``, or None where EXIF does not tell.
 
     In this order: the 35 mm equivalent over the diagonal (CIPA DCG-001), the focal length over the
-    sensor size of COLMAP's camera database, the same over the focal plane resolution. A result
-    outside ``PLAUSIBLE_FOCAL_RATIO`` is dropped.
+    sensor size of COLMAP's camera database, the same over the focal plane resolution. The latter two are times the
+    digital zoom; phones differ in whether the first has it. A result outside ``PLAUSIBLE_FOCAL_RATIO`` is dropped.
     """
     longer = max(width, height)
     if tags.focal_35mm is not None:
@@ -81,7 +84,7 @@ def focal_prior_px(tags: CameraTags, width: int, height: int) -> float | None:
         sensor_mm = database_sensor_mm(tags.make, tags.model) or tags.sensor_mm
         if sensor_mm is None:
             return None
-        focal = tags.focal_mm / sensor_mm * longer
+        focal = tags.focal_mm / sensor_mm * longer * (tags.digital_zoom or 1.0)
     else:
         return None
     low, high = PLAUSIBLE_FOCAL_RATIO

@@ -23,7 +23,7 @@ from smust3r_colmap.errors import ConfigError, InputError
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.world_frame import WorldFrame
 from smust3r_colmap.importers.colmap_model import MIN_IMAGES, ExternalModel, SurfacePoints
-from smust3r_colmap.importers.image_folder import FolderScan, natural_key, shared_prior
+from smust3r_colmap.importers.image_folder import FolderScan, bits_in_use, natural_key, shared_prior
 from smust3r_colmap.importers.images import Photo
 from smust3r_colmap.products import ImageCollection, PointCloud, RejectedImage, Scene, SourceImage
 
@@ -139,8 +139,9 @@ def fit_to_images(
     notes = list(model.fixes)
     matched, unused, rejected = _match_files(model, scan, notes)
     order = sorted(matched, key=lambda position: natural_key(matched[position].name))
-    files = [matched[position] for position in order]
     owners = [model.camera_ids[position] for position in order]
+    files = [_oriented(matched[position], model.cameras[owner]) for position, owner in zip(order, owners, strict=True)]
+    _remark_on_orientation(files, notes)
     resized = [
         _resized_to_file(model.cameras[owner], file, f"{owner} of {model.folder}")
         for owner, file in zip(owners, files, strict=True)
@@ -162,14 +163,16 @@ def fit_to_images(
         files, camera_of = [*files, *owned_by_others], (*camera_of, *owned_by_others.values())
         others = [*_of_no_file(model.unposed, unused), *rejected, *without_camera]
     _remark_on_unused([] if register_missing else unused, notes)
+    bits = bits_in_use(scan.records)
     images = tuple(
         SourceImage(
             name=file.name,
             path=scan.folder / file.name,
-            width=file.photo.width,
-            height=file.photo.height,
+            width=file.size[0],
+            height=file.size[1],
             camera=camera,
             digest=file.digest,
+            bits=bits.get(file.name),
         )
         for file, camera in zip(files, camera_of, strict=True)
     )
@@ -203,17 +206,19 @@ class _File:
     name: str
     digest: str
     photo: Photo
+    as_stored: bool = False
+    """Read without its EXIF orientation, because only so it has the shape that its camera has."""
 
     @property
     def size(self) -> tuple[int, int]:
-        return self.photo.width, self.photo.height
+        return self.photo.stored_size if self.as_stored else (self.photo.width, self.photo.height)
 
     @property
     def source(self) -> tuple[Hashable, ...]:
         """Equal for files that may come from one camera: folder, size and what EXIF says of the lens."""
         tags = self.photo.tags
         folder = PurePosixPath(self.name).parent
-        return str(folder), self.size, tags.make, tags.model, tags.focal_mm, tags.focal_35mm
+        return str(folder), self.size, tags.make, tags.model, tags.focal_mm, tags.focal_35mm, tags.digital_zoom
 
 
 _SPELLINGS: Mapping[str, Callable[[str], str]] = {
@@ -310,6 +315,33 @@ def _few(names: Iterable[str]) -> str:
     return ", ".join(shown[:_NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "") or "nothing"
 
 
+# ----------------------------------------------------------------------- orientation
+def _oriented(file: _File, camera: Intrinsics) -> _File:
+    """As its camera means it: COLMAP and others do not turn files by their EXIF orientation."""
+    stored = replace(file, as_stored=True)
+    return stored if _has_shape_of(stored, camera) and not _has_shape_of(file, camera) else file
+
+
+def _has_shape_of(file: _File, camera: Intrinsics) -> bool:
+    width, height = file.size
+    return _relative_difference(camera.width / camera.height, width / height) <= ASPECT_TOLERANCE
+
+
+def _remark_on_orientation(files: Sequence[_File], notes: list[str]) -> None:
+    stored = [file for file in files if file.as_stored]
+    if stored:
+        notes.append(
+            f"{len(stored)} files are read as stored, without their EXIF orientation, because the model is of these "
+            f"pixels, such as {stored[0].name!r}"
+        )
+    unclear = [file for file in files if not file.as_stored and file.photo.orientation != 1]
+    if unclear:
+        notes.append(
+            f"{len(unclear)} files are turned upright by their EXIF orientation, such as {unclear[0].name!r}; if the "
+            "model is of the pixels as stored, as COLMAP makes it, take the orientation out of the files"
+        )
+
+
 # --------------------------------------------------------------------------- cameras
 def _resized_to_file(camera: Intrinsics, file: _File, owner: str) -> Intrinsics:
     """The camera at the size of the file; each axis is scaled by itself, as the network's input was.
@@ -318,10 +350,10 @@ def _resized_to_file(camera: Intrinsics, file: _File, owner: str) -> Intrinsics:
         InputError: the shapes differ by more than ``ASPECT_TOLERANCE``: the image was cropped, padded or turned.
     """
     width, height = file.size
-    if _relative_difference(camera.width / camera.height, width / height) <= ASPECT_TOLERANCE:
+    if _has_shape_of(file, camera):
         return camera.resized(width, height)
     if _relative_difference(camera.width / camera.height, height / width) <= ASPECT_TOLERANCE:
-        way_out = "the model is of the image lying on its side, as it is without its EXIF orientation; turn the file"
+        way_out = "the model is of the image lying on its side; turn the file"
     else:
         way_out = "it was cropped or padded; give the images that the model was made of, or cameras for these"
     raise InputError(

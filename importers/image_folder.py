@@ -13,7 +13,7 @@ import os
 import re
 import unicodedata
 from collections import Counter, deque
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -28,7 +28,7 @@ from smust3r_colmap.execution.task_pool import usable_cores
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.camera_prior import DEFAULT_FOCAL_RATIO, focal_prior_px
 from smust3r_colmap.importers.frame_times import frame_times
-from smust3r_colmap.importers.images import MAX_FILE_BYTES, SUFFIXES, Photo, inspect
+from smust3r_colmap.importers.images import MAX_FILE_BYTES, SUFFIXES, UNREAD_SUFFIXES, Photo, inspect
 from smust3r_colmap.products import ImageCollection, RejectedImage, SourceImage
 from smust3r_colmap.storage.digest import digest_of
 
@@ -196,7 +196,10 @@ def _list_folder(folder: Path) -> _Listing:
     other_suffixes: Counter[str] = Counter()
     for name, problem in walk(folder):
         suffix = PurePosixPath(name).suffix.lower()
-        if not problem and suffix not in SUFFIXES:
+        if not problem and suffix in UNREAD_SUFFIXES:
+            reason = f"images of kind {suffix} are not read; convert it to JPEG, PNG or 16-bit TIFF"
+            unreadable.append(RejectedImage(name=_printable(name), reason=reason))
+        elif not problem and suffix not in SUFFIXES:
             other_suffixes[suffix] += 1
         elif reason := problem or _unusable_entry(folder, name):
             unreadable.append(RejectedImage(name=_printable(name), reason=reason))
@@ -320,6 +323,7 @@ def collection_from_scan(scan: FolderScan, config: CameraConfig) -> ImageCollect
         cameras = _known_cameras(cameras, config.camera_params, config.camera_model)
     camera_of = {index: camera for camera, members in enumerate(groups) for index in members}
     times = frame_times(scan.folder)
+    bits = bits_in_use(scan.records)
     images = tuple(
         SourceImage(
             name=image.name,
@@ -329,6 +333,7 @@ def collection_from_scan(scan: FolderScan, config: CameraConfig) -> ImageCollect
             camera=camera_of[index],
             digest=image.digest,
             timestamp_s=times.get(image.name),
+            bits=bits.get(image.name),
         )
         for index, image in enumerate(usable)
     )
@@ -336,6 +341,18 @@ def collection_from_scan(scan: FolderScan, config: CameraConfig) -> ImageCollect
     return ImageCollection(
         images=images, cameras=tuple(cameras), rejected=tuple(rejected), calibrated=config.camera_params is not None
     )
+
+
+def bits_in_use(records: Iterable[ImportRecord]) -> dict[str, int]:
+    """By name, of images with more than 8 bits a channel: the most that images of that folder, size and camera use.
+
+    One number for all of them: with one for each, neighbours would differ in brightness.
+    """
+    sources: dict[Hashable, int] = {}
+    deep = [(r.name, _auto_key(r.name, r.photo), r.photo.bits) for r in records if r.photo is not None and r.photo.deep]
+    for _, source, bits in deep:
+        sources[source] = max(bits, sources.get(source, 0))
+    return {name: sources[source] for name, source, _ in deep}
 
 
 def _without_name_twins(records: Sequence[ImportRecord]) -> tuple[list[_Usable], list[RejectedImage]]:
@@ -375,13 +392,14 @@ def _check_enough(scan: FolderScan, usable: Sequence[_Usable], rejected: Sequenc
 
 
 # ------------------------------------------------------------------------------ cameras
-def _auto_key(image: _Usable) -> Hashable:
-    tags = image.photo.tags
-    return image.folder, image.size, tags.make, tags.model, tags.focal_mm, tags.focal_35mm
+def _auto_key(name: str, photo: Photo) -> Hashable:
+    tags = photo.tags
+    folder, size = str(PurePosixPath(name).parent), (photo.width, photo.height)
+    return folder, size, tags.make, tags.model, tags.focal_mm, tags.focal_35mm, tags.digital_zoom
 
 
 _CAMERA_KEYS: Mapping[CameraMode, Callable[[_Usable], Hashable]] = {
-    "auto": _auto_key,
+    "auto": lambda image: _auto_key(image.name, image.photo),
     "single": lambda image: None,
     "per-folder": lambda image: image.folder,
     "per-image": lambda image: image.name,

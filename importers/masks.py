@@ -1,14 +1,16 @@
 """Masks of images: pixels that features, depth and trainers do not use.
 
 Names are COLMAP's: the mask of an image is ``<name>.png`` below the folder of masks, else ``<name without
-suffix>.png``; what is black in it is left out, everything else is kept. An image without a mask is used as a whole
-(COLMAP's feature extraction passes over it). A mask has the size of the upright image; its own EXIF orientation is
-ignored. The next module to read is ``masked_maps``, which applies masks to depth.
+suffix>.png``; what is black or transparent in it is left out, everything else is kept. An image without a mask is used
+as a whole (COLMAP's feature extraction passes over it), but for what its own alpha leaves out. A mask has the size of
+the upright image; its own EXIF orientation is ignored. The next module to read is ``masked_maps``, which applies masks
+to depth.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -16,10 +18,14 @@ import cv2
 import numpy as np
 
 from smust3r_colmap.errors import ImageError, InputError
+from smust3r_colmap.execution.task_pool import usable_cores
 from smust3r_colmap.geometry.arrays import UInt8Array
-from smust3r_colmap.importers.images import stored_size
+from smust3r_colmap.importers.images import load_alpha, stored_size
 from smust3r_colmap.products import ImageCollection, ImageMask, SourceImage
 from smust3r_colmap.storage.digest import digest_of
+
+MAX_THREADS = 4
+"""Each holds a mask in memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,11 +64,43 @@ def with_masks(collection: ImageCollection, folder: Path) -> ImageCollection:
     return replace(collection, images=images)
 
 
+def with_alpha(collection: ImageCollection, transparent: Mapping[str, float]) -> ImageCollection:
+    """The collection with alpha as the mask of every image that has transparent pixels and no other mask.
+
+    Args:
+        transparent: part of the pixels by the name of the image.
+    """
+
+    def of(image: SourceImage) -> SourceImage:
+        if image.mask is not None or not transparent.get(image.name):
+            return image
+        return replace(image, mask=ImageMask(path=image.path, digest=image.digest, of_alpha=True))
+
+    return replace(collection, images=tuple(map(of, collection.images)))
+
+
+def left_out_shares(images: Sequence[SourceImage]) -> dict[str, float]:
+    """Part of the pixels that the mask leaves out, by the name of each image that has one.
+
+    Raises:
+        ImageError: a mask cannot be read, or has another size than its image.
+    """
+    masked = [image for image in images if image.mask is not None]
+    with ThreadPoolExecutor(min(usable_cores(), MAX_THREADS)) as pool:
+        return dict(zip((image.name for image in masked), pool.map(_left_out, masked), strict=True))
+
+
+def _left_out(image: SourceImage) -> float:
+    assert image.mask is not None
+    return float((load_mask(image.mask.path, image) == 0).mean())
+
+
 def masks_of(collection: ImageCollection, folder: Path | None) -> MaskSet | None:
     """What ``with_masks`` found in ``folder``, to be kept with the results; None where no folder is named."""
     if folder is None:
         return None
-    digests = {image.name: image.mask.digest for image in collection.images if image.mask is not None}
+    masks = {image.name: image.mask for image in collection.images}
+    digests = {name: mask.digest for name, mask in masks.items() if mask is not None and not mask.of_alpha}
     return MaskSet(folder=folder, digest_of=digests)
 
 
@@ -104,15 +142,21 @@ def load_mask(path: Path, image: SourceImage) -> UInt8Array:
     Raises:
         ImageError: the file is gone, does not decode, has another size than the image, or is the image itself.
     """
+    if image.mask is not None and image.mask.of_alpha:
+        alpha = load_alpha(image)
+        return np.full((image.height, image.width), 255, np.uint8) if alpha is None else alpha
     if path.resolve() == image.path.resolve():
         raise _is_photograph(path, image.name)
-    # Grey with the depth of the file: at 8 bits the small numbers of 16-bit labels would become black.
-    stored = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    mask = cv2.imdecode(np.frombuffer(_read(path) or b"\0", np.uint8), stored)
+    # As stored: in 8 bits of grey, small numbers of 16-bit labels and dark colours of labels would become black.
+    mask = cv2.imdecode(np.frombuffer(_read(path) or b"\0", np.uint8), cv2.IMREAD_UNCHANGED)
     if mask is None:
         raise _no_image(path)
     _check_size(path, (mask.shape[1], mask.shape[0]), image)
-    return np.where(mask > 0, 255, 0).astype(np.uint8)
+    channels = mask.reshape(*mask.shape[:2], -1)
+    kept = (channels[:, :, :3] > 0).any(axis=2)
+    if channels.shape[2] == 4:
+        kept &= channels[:, :, 3] > 0
+    return np.where(kept, 255, 0).astype(np.uint8)
 
 
 def _with_mask(image: SourceImage, folder: Path) -> SourceImage:

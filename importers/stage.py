@@ -26,7 +26,7 @@ from smust3r_colmap.importers.image_folder import (
     collection_from_scan,
 )
 from smust3r_colmap.importers.image_scan import scan_changed_files
-from smust3r_colmap.importers.masks import names_without_mask, with_masks
+from smust3r_colmap.importers.masks import left_out_shares, names_without_mask, with_alpha, with_masks
 from smust3r_colmap.importers.video import open_video
 from smust3r_colmap.importers.video_frames import (
     VideoFile,
@@ -40,6 +40,8 @@ from smust3r_colmap.products import ImageCollection, RejectedImage
 from smust3r_colmap.storage.codec import Codec
 from smust3r_colmap.storage.run_directory import FRAMES_STAGE, StageFolder, key_of, storage_errors
 
+MANY_PIXELS = 0.5
+"""Masks that leave out more than that on average are often inverted."""
 VIDEO_REPORT: Codec[VideoReport] = Codec(VideoReport, "video")
 """In the folder of the frames of a video."""
 
@@ -167,9 +169,10 @@ def read_images(
     with run.clock.stage("import", total=1) as progress:
         scan = scan_changed_files(source.folder, run.folder, overwrite=overwrite, workers=num_workers(config.workers))
         scan = replace(scan, unreadable=(*scan.unreadable, *source.left_out))
-        collection = _checked(run, collection_from_scan(scan, config.cameras), config)
+        collection = _checked(run, collection_from_scan(scan, config.cameras), scan, config)
         progress.advance()
     _tell_rejected(run, collection)
+    _tell_passed_over(run, scan)
     return scan, collection
 
 
@@ -191,7 +194,7 @@ def fit_model(
             calibrated=config.cameras.calibrated,
             register_missing=config.refinement.register_missing,
         )
-        fitted = replace(fitted, collection=_checked(run, fitted.collection, config))
+        fitted = replace(fitted, collection=_checked(run, fitted.collection, scan, config))
         progress.advance()
     for note in fitted.notes:
         run.clock.note(note)
@@ -199,16 +202,58 @@ def fit_model(
     return scan, fitted
 
 
-def _checked(run: Run, collection: ImageCollection, config: RunConfig | RefineConfig) -> ImageCollection:
-    """With the masks of the folder, where one is named."""
+def _checked(
+    run: Run, collection: ImageCollection, scan: FolderScan, config: RunConfig | RefineConfig
+) -> ImageCollection:
+    """With the masks of the folder, where one is named, and of alpha."""
     if config.output.text:
         refuse_names_text_cannot_hold(image.name for image in collection.images)
-    if config.masks is None:
-        return collection
-    masked = with_masks(collection, config.masks)
-    if whole := names_without_mask(masked.images):
-        run.clock.warn(f"{len(whole)} of {len(masked)} images have no mask and are used as a whole, such as {whole[0]}")
+    if config.masks is not None:
+        collection = with_masks(collection, config.masks)
+        if whole := names_without_mask(collection.images):
+            run.clock.warn(
+                f"{len(whole)} of {len(collection)} images have no mask and are used as a whole, such as {whole[0]}"
+            )
+    photos = {record.name: record.photo for record in scan.records if record.photo is not None}
+    masked = with_alpha(collection, {name: photo.transparent for name, photo in photos.items()})
+    _tell_masks(run, masked)
+    if unreadable := [image.name for image in masked.images if photos[image.name].exif_unreadable]:
+        run.clock.note(
+            f"the EXIF of {len(unreadable)} images cannot be read and is not used, such as that of {unreadable[0]}"
+        )
     return masked
+
+
+def _tell_masks(run: Run, collection: ImageCollection) -> None:
+    """What share of the pixels the masks leave out: an inverted or empty mask looks like any other."""
+    if of_alpha := [image.name for image in collection.images if image.mask is not None and image.mask.of_alpha]:
+        run.clock.note(
+            f"alpha is the mask of {len(of_alpha)} images, such as {of_alpha[0]}: their transparent pixels are not used"
+        )
+    shares = left_out_shares(collection.images)
+    if not shares:
+        return
+    mean = sum(shares.values()) / len(shares)
+    text = f"the masks leave out {mean:.1%} of the pixels of their images"
+    if mean in (0.0, 1.0):
+        run.clock.warn(
+            f"{text}; what is black or transparent in a mask is left out, and everything else is kept: are they "
+            f"{'empty' if mean else 'labels whose background is not 0'}, or inverted?"
+        )
+        return
+    run.clock.note(text)
+    if whole := [name for name, share in shares.items() if share == 1.0]:
+        run.clock.warn(f"the masks of {len(whole)} images leave out all of their pixels, such as that of {whole[0]}")
+    if mean > MANY_PIXELS:
+        run.clock.warn("that is more than half; what is black or transparent in a mask is left out: are they inverted?")
+
+
+def _tell_passed_over(run: Run, scan: FolderScan) -> None:
+    if scan.other_suffixes:
+        kinds = ", ".join(
+            f"{count} {suffix or 'without suffix'}" for suffix, count in sorted(scan.other_suffixes.items())
+        )
+        run.clock.note(f"passed over, for they are no images: {kinds}")
 
 
 def _tell_rejected(run: Run, collection: ImageCollection) -> None:

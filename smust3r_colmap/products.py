@@ -28,10 +28,12 @@ class ImageMask:
     Args:
         path: where the file lies.
         digest: hash of its content, part of the keys of the stages that look at it.
+        of_alpha: it is the image itself, and its alpha is the mask.
     """
 
     path: Path
     digest: str
+    of_alpha: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +48,8 @@ class SourceImage:
         digest: hash of the file's content, part of every key of a stage.
         timestamp_s: capture time, where the source has one.
         mask: what of it is to be used; None for all.
+        bits: of each channel, that all images of its camera are scaled by if they have more than 8; None looks at the
+            file alone.
     """
 
     name: str
@@ -56,6 +60,7 @@ class SourceImage:
     digest: str
     timestamp_s: float | None = None
     mask: ImageMask | None = None
+    bits: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

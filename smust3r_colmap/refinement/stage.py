@@ -228,7 +228,7 @@ def refine_external(
     refinement = refine(run, initial, collection, features, RefinementConfig(**vars(options)), feature_options)
     assert refinement is not None, "switched on"
     (result,), (scene,) = refinement.results, initial.scenes
-    if result.num_unverified_pairs <= result.num_pairs:
+    if result.succeeded and result.num_unverified_pairs <= result.num_pairs:
         return refinement
     agreeing = agreement(
         read_matched_features(features.database, scene.image_indices),
@@ -237,20 +237,21 @@ def refine_external(
         tolerance=initial.tolerance,
     )
     best = best_reading(agreeing)
+    if not result.succeeded and (not agreeing or best == AS_COLMAP):  # for want of matches, or of points
+        return refinement
     if best is None or best == AS_COLMAP:
         hint = (
-            "nor with the poses read in any other usual way. Are these the images of the model, and its focal lengths "
-            "in pixels of the full image?"
+            "nor do more with another usual reading. Are these the images of the model, as it saw them (COLMAP ignores "
+            "their EXIF orientation), and are its focal lengths in pixels of the full image?"
         )
     else:
         hint = (
-            f"but {agreeing[best]:.0%} of all matches do if the model has {best}. Write the poses as COLMAP's: from "
+            f"but {agreeing[best]:.0%} do if the model has {best}. Write the poses as COLMAP's: from "
             "world to camera, axes x right, y down, z forward, and quaternions QW QX QY QZ"
         )
-    raise InputError(
-        f"the matches of {result.num_pairs} image pairs agree with the poses of the model and those of "
-        f"{result.num_unverified_pairs} do not, so no result is written; {hint}"
-    )
+    num_pairs = result.num_pairs + result.num_unverified_pairs
+    agreed = f"{agreeing[AS_COLMAP]:.0%} of the" if agreeing else f"only {result.num_pairs} of {num_pairs} pairs'"
+    raise InputError(f"{agreed} matches agree with the poses of the model, so no result is written, {hint}")
 
 
 def _match(run: Run, seen: Sequence[Sequence[SeenSurface]], features: RunFeatures, per_image: int) -> tuple[Pair, ...]:

@@ -266,7 +266,7 @@ def test_poses_of_another_meaning_are_named_and_nothing_is_written(
     (model / "images.txt").write_text("".join(f"{' '.join(words)}\n" for words in lines))
     shutil.copytree(result.output / "work/features", tmp_path / "out/work/features")
     (tmp_path / "out/work/lock").touch()
-    with pytest.raises(InputError, match="of all matches do if the model has camera centres in place of translations"):
+    with pytest.raises(InputError, match="% do if the model has camera centres in place of translations"):
         refined(replace(command(export, tmp_path / "out"), model=model))
     assert not (tmp_path / "out/sparse").exists()
 

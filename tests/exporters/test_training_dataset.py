@@ -270,6 +270,43 @@ def test_images_that_are_right_already_are_copied_byte_by_byte(tmp_path: Path) -
     assert np.abs(written.rgb("turned.jpg")[::-1, ::-1, :2].astype(int) - ramp()[:, :, :2]).mean() < 2
 
 
+def test_sixteen_bit_images_are_scaled_by_the_bits_of_their_camera(tmp_path: Path) -> None:
+    """The red of the ramp says its column in steps of 64; by its own peak each image would be four times as bright."""
+    images = tmp_path / "in"
+    images.mkdir()
+    names = ("a.png", "b.png", "c.png", "d.png")
+    for name in names:
+        cv2.imwrite(str(images / name), ramp()[:, :, ::-1].astype(np.uint16) * 64)
+    folder = tmp_path / "trainer"
+    bits = dict.fromkeys(names, 16)
+    write_training_dataset(plane_model((PINHOLE,), names), images, folder, maps=None, cloud=None, bits=bits)
+    for path in (folder / "images").iterdir():
+        written = np.asarray(Image.open(path)).astype(int)
+        assert np.abs(written - ramp().astype(float) * 64 / 257).max() <= 0.51
+
+
+def test_an_image_that_the_model_has_as_stored_is_written_so(tmp_path: Path) -> None:
+    images = write_ramps(tmp_path / "in")
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(ramp()).save(images / NAMES[0], exif=exif)
+    written = write(tmp_path, plane_model((PINHOLE,)))
+    assert np.array_equal(written.rgb(written.names[NAMES[0]]), ramp())
+    assert (written.folder / "images" / written.names[NAMES[0]]).read_bytes() != (images / NAMES[0]).read_bytes()
+
+
+def test_alpha_of_images_becomes_their_masks(tmp_path: Path) -> None:
+    images = write_ramps(tmp_path / "in")
+    alpha = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    alpha[:, :40] = 0
+    Image.fromarray(np.dstack([ramp(), alpha])).save(images / NAMES[1])
+    written = write(tmp_path, plane_model((PINHOLE,)))
+    frames = json.loads((written.folder / "transforms.json").read_text())["frames"]
+    found = {frame["file_path"]: np.asarray(Image.open(written.folder / frame["mask_path"])) for frame in frames}
+    assert np.array_equal(found[f"images/{written.names[NAMES[1]]}"], alpha)
+    assert all((mask == 255).all() for path, mask in found.items() if not path.endswith(written.names[NAMES[1]]))
+
+
 def test_smaller_copies_pair_by_sorted_lists_and_are_means_over_areas(tmp_path: Path) -> None:
     written = write(tmp_path, plane_model((PINHOLE,)), scales=(2, 7))
     full = sorted(path.name for path in (written.folder / "images").iterdir())
@@ -476,8 +513,8 @@ def test_missing_and_misfit_images_are_refused_before_anything_is_written(tmp_pa
         write_training_dataset(*arguments, maps=None, cloud=None)
     exif = Image.Exif()
     exif[0x0112] = 6
-    Image.fromarray(ramp()).save(images / "4.png", exif=exif)
-    with pytest.raises(ImageError, match=r"is 120x160 px \(stored as 160x120, turned by its EXIF orientation\)"):
+    Image.fromarray(ramp(80, 60)).save(images / "4.png", exif=exif)
+    with pytest.raises(ImageError, match=r"is 60x80 px \(stored as 80x60, turned by its EXIF orientation\)"):
         write_training_dataset(*arguments, maps=None, cloud=None)
     (images / "4.png").write_text("no image")
     with pytest.raises(ImageError, match=r"^4\.png: cannot be read as JPEG, PNG, WebP or TIFF"):

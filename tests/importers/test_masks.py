@@ -40,7 +40,7 @@ from smust3r_colmap.features.sift import extract_features
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.image_folder import import_image_folder
-from smust3r_colmap.importers.masks import load_mask, names_without_mask, with_masks
+from smust3r_colmap.importers.masks import left_out_shares, load_mask, names_without_mask, with_alpha, with_masks
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.products import ImageCollection, ImageMask, SourceImage
 from smust3r_colmap.refine_model import refine_model
@@ -118,6 +118,62 @@ def test_whatever_is_not_black_is_kept_at_any_depth(tmp_path: Path) -> None:
         Image.fromarray(pixels).save(tmp_path / name)
         found = load_mask(tmp_path / name, image)
         assert np.array_equal(found, np.where(labels > 0, 255, 0))
+
+
+KEPT = np.arange(80 * 60).reshape(60, 80) % 80 >= 20
+"""The mask of an image of 80 x 60 px: the left quarter is left out."""
+
+
+def palette(colour: tuple[int, int, int]) -> Image.Image:
+    """Labels 0, black, and 1, of this colour."""
+    labels = Image.fromarray(KEPT.astype(np.uint8)).convert("P")
+    labels.putdata(KEPT.astype(np.uint8).ravel().tolist())
+    labels.putpalette([0, 0, 0, *colour] + [0] * 762)
+    return labels
+
+
+def rgba(grey: object, alpha: object) -> Image.Image:
+    layers = [np.broadcast_to(np.asarray(layer, np.uint8), KEPT.shape) for layer in (grey, grey, grey, alpha)]
+    return Image.fromarray(np.dstack(layers))
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [
+        Image.fromarray(KEPT.astype(np.uint8) * 255),
+        Image.fromarray(KEPT.astype(np.uint8)),
+        Image.fromarray(KEPT),
+        Image.fromarray(np.dstack([KEPT * 0, KEPT * 0, KEPT * 1]).astype(np.uint8)),
+        rgba(255, KEPT * 255),
+        rgba(KEPT * 255, 255),
+        rgba(KEPT * 255, KEPT * 255),
+        Image.fromarray(np.dstack([KEPT * 0 + 255, KEPT * 255]).astype(np.uint8)),
+        palette((128, 0, 0)),
+        palette((0, 0, 3)),
+    ],
+    ids=["255", "one", "1-bit", "dark blue", "alpha only", "opaque", "both", "grey alpha", "palette", "dark palette"],
+)
+def test_masks_are_read_as_tools_write_them(mask: Image.Image, tmp_path: Path) -> None:
+    mask.save(tmp_path / "m.png")
+    image = SourceImage(name="a", path=tmp_path / "a", width=80, height=60, camera=0, digest="")
+    assert np.array_equal(load_mask(tmp_path / "m.png", image) > 0, KEPT)
+
+
+def test_alpha_is_the_mask_of_images_without_another(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    for name in ("a.png", "b.png", "c.png"):
+        rgba(90 + ord(name[0]), 255 if name == "c.png" else KEPT * 255).save(tmp_path / "photos" / name)
+    write_mask(tmp_path / "masks" / "b.png", 80, 60)
+    collection = import_image_folder(tmp_path / "photos", CameraConfig())
+    masked = with_alpha(with_masks(collection, tmp_path / "masks"), {"a.png": 0.25, "b.png": 0.25, "c.png": 0.0})
+    a, b, c = masked.images
+    assert a.mask is not None and a.mask.of_alpha and a.mask.digest == a.digest
+    assert np.array_equal(load_mask(a.mask.path, a) > 0, KEPT)
+    assert b.mask is not None and not b.mask.of_alpha
+    assert c.mask is None
+    shares = left_out_shares(masked.images)
+    assert list(shares) == ["a.png", "b.png"]
+    assert shares["a.png"] == pytest.approx(0.25)
 
 
 def test_masks_of_nothing_are_refused(drive: Drive, tmp_path: Path) -> None:
