@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from show_structure import PACKAGE, arrows, circles, imports_of, modules, room_of
+from show_structure import PACKAGE, Arrows, arrows, circles, imports_of, modules, room_of
 
 ORDER = (
     # foundations: they know no stage
@@ -49,14 +49,19 @@ def test_every_room_has_its_place_in_the_order() -> None:
     assert rooms == set(ORDER)
 
 
-def test_imports_go_one_way() -> None:
+@pytest.fixture(scope="module")
+def structure() -> Arrows:
+    return arrows()
+
+
+def test_imports_go_one_way(structure: Arrows) -> None:
     place = {room: k for k, room in enumerate(ORDER)}
-    upward = [one for (a, b), imports in arrows().items() if place[a] < place[b] for one in imports]
+    upward = [one for (a, b), imports in structure.items() if place[a] < place[b] for one in imports]
     assert not upward, upward
 
 
-def test_there_is_no_circle() -> None:
-    assert circles(arrows()) == []
+def test_there_is_no_circle(structure: Arrows) -> None:
+    assert circles(structure) == []
 
 
 @pytest.mark.parametrize("room", STAGES)
