@@ -87,6 +87,15 @@ def choose_frames(frames: Iterable[VideoFrame], *, fps: float | None) -> Iterato
     yield from rule.end()
 
 
+def displacement(before: UInt8Array, after: UInt8Array) -> float:
+    """How far the image moved, as a share of its longer side; infinite where the two differ too much.
+
+    Args:
+        before, after: (H, W) grey values of one size.
+    """
+    return _Corners(_small(before)).motion(_small(after))
+
+
 # ------------------------------------------------------------------------------------ shots
 def _shots(frames: Iterable[VideoFrame]) -> Iterator[tuple[int, VideoFrame]]:
     """Each frame with the number of its shot, from 1. The frames of a flash are left out."""

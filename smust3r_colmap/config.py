@@ -15,6 +15,7 @@ from typing import Literal
 from smust3r_colmap.errors import ConfigError
 
 Auto = Literal["auto"]
+Order = Literal["auto", "sequence", "unordered"]
 CameraMode = Literal["auto", "single", "per-folder", "per-image"]
 KeyframeStrategy = Literal["linspace", "retrieval", "every-kth", "overlap"]
 CameraFit = Literal["robust", "upstream", "pnp"]
@@ -70,12 +71,20 @@ class VideoConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class SegmentationConfig:
-    """Cutting the sequence (paper section III-B)."""
+    """Cutting the collection into segments (paper section III-B)."""
 
+    order: Order = "auto"
+    """Whether images that follow each other in name order show the same place: sequence, or unordered; auto decides by
+    their likeness, folder by folder."""
+    keyframes: int | Literal["auto", "all"] = "auto"
+    """Images that carry the reconstruction: all of them, so many, or those between which a video moves enough (auto).
+    The others are registered to the refined model."""
     segment_length: int = 60
     """Images per segment (l); the paper's setting."""
     overlap: int = 20
     """Images shared by neighbouring segments (p). The paper's 30 costs a third more and is no more accurate."""
+    retrieval_neighbours: int = 20
+    """Images that each image is matched with because they look alike, where there is no order."""
 
     def __post_init__(self) -> None:
         if self.segment_length < 2:
@@ -84,6 +93,9 @@ class SegmentationConfig:
             raise ConfigError(f"--overlap {self.overlap}: neighbouring segments must share at least 1 image")
         if self.overlap >= self.segment_length:
             raise ConfigError(f"--overlap {self.overlap} must be smaller than --segment-length {self.segment_length}")
+        _check_at_least(self, retrieval_neighbours=1)
+        if isinstance(self.keyframes, int):
+            _check_at_least(self, keyframes=2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +139,7 @@ class Must3rConfig:
     `weights fetch` put into the cache."""
     network_size: int = 512
     """Longer side of the images in the network; other sizes than the trained one interpolate positions."""
-    keyframes: KeyframeStrategy = "linspace"
+    network_keyframes: KeyframeStrategy = "linspace"
     """Images of a segment that the network remembers: evenly spread (linspace), unlike each other (retrieval), every
     k-th, or where something new is seen (overlap)."""
     max_keyframes: int = 50

@@ -66,7 +66,7 @@ def reconstruct(
         scan, collection = importers.read_images(run, source, config, overwrite=overwrite)
         backbone = backbones.make(run, factory, collection, config)
         begin_stages(run, scan, overwrite=overwrite)
-        segments = segmentation.plan(run, len(collection), backbone.describe, config.segmentation, config.loop_closing)
+        segments = segmentation.plan(run, collection, backbone.describe, config)
         submodels = backbones.reconstruct(backbone, segments, collection, config.alignment)
         edges = alignment.align(run, submodels, segments, config.alignment)
         stitched = stitching.stitch(run, submodels, edges, segments, collection, config.alignment, config.loop_closing)

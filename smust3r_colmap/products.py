@@ -113,7 +113,7 @@ class ImageCollection:
 
 
 # ----------------------------------------------------------------------- segmentation
-SegmentKind = Literal["window", "loop"]
+SegmentKind = Literal["window", "cluster", "loop"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +123,8 @@ class Segment:
     Args:
         index: number of the segment in the plan.
         images: indices into the collection, in order, without repeats.
-        kind: ``"window"`` of the sequence, or ``"loop"``: images around the two ends of a loop.
+        kind: ``"window"`` of a sequence, ``"cluster"`` of images that match each other, or ``"loop"``: images around
+            the two ends of a loop.
     """
 
     index: int

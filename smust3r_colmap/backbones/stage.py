@@ -24,7 +24,7 @@ class SegmentSummary:
 
     Args:
         index: of the segment in the plan.
-        kind: ``"window"`` or ``"loop"``.
+        kind: ``"window"``, ``"cluster"`` or ``"loop"``.
         num_images: images it was given.
         num_submodels: connected submodels that came out; 0 when nothing did.
         num_registered: images with a pose, over all its submodels.
@@ -79,7 +79,7 @@ def _segments_with_maps(backbone: Backbone, segments: Segments, alignment: Align
     """Windows make the cloud; loops only tie the graph, and need maps where the edges are made of them."""
     source = alignment.alignment_source
     edges_from_maps = source == "pointmaps" or (source == "auto" and not backbone.has_tracks)
-    return frozenset(segment.index for segment in segments.all if segment.kind == "window" or edges_from_maps)
+    return frozenset(segment.index for segment in segments.all if segment.kind != "loop" or edges_from_maps)
 
 
 def summarise_segments(segments: Segments, result: BackboneResult) -> tuple[SegmentSummary, ...]:

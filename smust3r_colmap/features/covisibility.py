@@ -7,7 +7,7 @@ seen there. The next module to read is ``matching``.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,7 +61,13 @@ def sample_rows(count: int, wanted: int) -> npt.NDArray[np.int64]:
     return rows if count else rows[:0]
 
 
-def select_pairs(surfaces: Sequence[SeenSurface], *, per_image: int, known: Collection[Pair]) -> tuple[Pair, ...]:
+def select_pairs(
+    surfaces: Sequence[SeenSurface],
+    *,
+    per_image: int,
+    known: Collection[Pair],
+    around: Callable[[int, int], Iterable[int]],
+) -> tuple[Pair, ...]:
     """New pairs (i < j) of images that see the same surface, at most ``per_image`` chosen for each image.
 
     The highest covisibility comes first. Images next in order to an existing partner are left out, so that pairs reach
@@ -71,6 +77,7 @@ def select_pairs(surfaces: Sequence[SeenSurface], *, per_image: int, known: Coll
         surfaces: of all images of a model.
         per_image: new pairs chosen for an image; it can be chosen by others, too.
         known: matched pairs, which are not returned.
+        around: the images at most so many steps before or after an image, see ``ViewGraph.around``.
     """
     scores = covisibility(surfaces)
     images = np.array([surface.image for surface in surfaces], dtype=np.int64)
@@ -89,7 +96,7 @@ def select_pairs(surfaces: Sequence[SeenSurface], *, per_image: int, known: Coll
             other = int(images[column])
             if new == per_image:
                 break
-            if any(other + step in taken for step in range(-SAME_PLACE_IMAGES, SAME_PLACE_IMAGES + 1)):
+            if not taken.isdisjoint(np.asarray(around(other, SAME_PLACE_IMAGES)).tolist()):
                 continue
             taken.add(other)
             chosen.add((min(image, other), max(image, other)))

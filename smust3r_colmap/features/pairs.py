@@ -5,7 +5,8 @@ The next module to read is ``sift``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter, defaultdict
+from collections.abc import Collection, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -17,6 +18,8 @@ from smust3r_colmap.products import Segment
 
 MAX_TURN_DEG = 60.0
 """Between the viewing directions of two cameras; beyond, their images rarely overlap."""
+_BLOCK = 1_024
+"""Images compared with all others at once."""
 
 
 def plan_pairs(segment: Segment, *, neighbours: int, exhaustive_below: int) -> tuple[Pair, ...]:
@@ -26,8 +29,8 @@ def plan_pairs(segment: Segment, *, neighbours: int, exhaustive_below: int) -> t
     """
     images = sorted(segment.images)
     if len(images) <= exhaustive_below:
-        return _near_pairs(images, len(images) - 1)
-    return _near_pairs(images, neighbours)
+        return near_pairs(images, len(images) - 1)
+    return near_pairs(images, neighbours)
 
 
 def plan_loop_pairs(
@@ -41,7 +44,7 @@ def plan_loop_pairs(
     Args:
         runs: the images of either end, in order. descriptors: (N, D) unit vectors of all images of the collection.
     """
-    pairs = [pair for run in runs for pair in _near_pairs(run, neighbours)]
+    pairs = [pair for run in runs for pair in near_pairs(run, neighbours)]
     for first, second in combinations(runs, 2):
         similarity = descriptors[list(first)] @ descriptors[list(second)].T
         wanted = np.zeros(similarity.shape, dtype=bool)
@@ -53,8 +56,8 @@ def plan_loop_pairs(
     return tuple(pairs)
 
 
-def _near_pairs(images: Sequence[int], neighbours: int) -> tuple[Pair, ...]:
-    """Each image with its next ``neighbours`` and the images at doubling steps."""
+def near_pairs(images: Sequence[int], neighbours: int) -> tuple[Pair, ...]:
+    """Pairs of a sequence: each image with its next ``neighbours`` and the images at doubling steps."""
     n = len(images)
     doubling = [2**k for k in range(1, n.bit_length()) if neighbours < 2**k < n]
     offsets = [*range(1, min(neighbours + 1, n)), *doubling]
@@ -66,17 +69,47 @@ def alike_pairs(
 ) -> tuple[Pair, ...]:
     """Pairs (i < j) of each image without a pose with the most similar ones; of few images, all.
 
+    Memory grows with the number of images, not with its square.
+
     Args:
-        descriptors: (N, D) unit vectors. num_posed: images from this one on have no pose.
+        descriptors: (N, D) unit vectors; zero rows are in no pair. num_posed: images from this one on have no pose.
         per_image: most similar others of each, with and without a pose.
         exhaustive_below: up to so many images every pair is taken.
     """
     n = len(descriptors)
     wanted = n - 1 if n <= exhaustive_below else min(per_image, n - 1)
-    similarity = descriptors[num_posed:] @ descriptors.T
-    similarity[np.arange(n - num_posed), np.arange(num_posed, n)] = -np.inf
-    most_alike = np.argsort(-similarity, axis=1, kind="stable")[:, :wanted]
-    return tuple(sorted({(min(i, j), max(i, j)) for i, row in enumerate(most_alike.tolist(), num_posed) for j in row}))
+    described: npt.NDArray[np.bool_] = np.any(descriptors, axis=1)
+    pairs: set[Pair] = set()
+    for start in range(num_posed, n, _BLOCK):
+        rows = np.arange(start, min(start + _BLOCK, n))
+        similarity = descriptors[rows] @ descriptors.T
+        similarity[:, ~described] = -np.inf
+        similarity[rows - start, rows] = -np.inf
+        most_alike = np.argsort(-similarity, axis=1, kind="stable")[:, :wanted]
+        for i, others in zip(rows[described[rows]].tolist(), most_alike[described[rows]].tolist(), strict=True):
+            pairs |= {(min(i, j), max(i, j)) for j in others if described[j] and i != j}
+    return tuple(sorted(pairs))
+
+
+def further_pairs(verified: Collection[Pair], tried: Collection[Pair], *, per_image: int) -> tuple[Pair, ...]:
+    """Pairs (i < j) that have not been tried, of images that match the same others: what retrieval missed.
+
+    Args:
+        verified: pairs with enough verified matches. tried: all pairs that have been matched.
+        per_image: pairs chosen for an image, those with most common partners first; at least two are needed.
+    """
+    partners: dict[int, set[int]] = defaultdict(set)
+    for i, j in verified:
+        partners[i].add(j)
+        partners[j].add(i)
+    known = set(tried)
+    found: set[Pair] = set()
+    for i in sorted(partners):
+        common = Counter(j for k in partners[i] for j in partners[k] if j != i)
+        new = [(j, count) for j, count in common.items() if count > 1 and (min(i, j), max(i, j)) not in known]
+        new.sort(key=lambda row: (-row[1], row[0]))
+        found |= {(min(i, j), max(i, j)) for j, _ in new[:per_image]}
+    return tuple(sorted(found))
 
 
 def neighbouring_pairs(cam_from_world: FloatArray, *, per_image: int, exhaustive_below: int) -> tuple[Pair, ...]:

@@ -8,11 +8,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
+import pycolmap
 
 from smust3r_colmap.colmap.database import create_database, open_database
 from smust3r_colmap.config import FeatureConfig
 from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.execution.run_context import Run
+from smust3r_colmap.features.guided_verification import MIN_VERIFIED
 from smust3r_colmap.features.matching import drop_matches_without_evidence, find_static_parts, match_pairs
 from smust3r_colmap.features.pairs import alike_pairs, neighbouring_pairs
 from smust3r_colmap.features.sift import extract_features
@@ -84,6 +86,19 @@ def match_pairs_of_run(
             "training images, too"
         )
     return matched
+
+
+def verified_pairs(run: Run, features: RunFeatures, pairs: Iterable[Pair], *, title: str) -> dict[Pair, int]:
+    """Match and verify pairs; the number of verified matches of those that have ``MIN_VERIFIED``, by ascending pair."""
+    matched = match_pairs_of_run(run, features, pairs, title=title)
+    with open_database(features.database) as opened:
+        pair_ids, counts = opened.read_two_view_geometry_num_inliers()
+    found = {}
+    for pair_id, count in zip(pair_ids, counts, strict=True):
+        a, b = pycolmap.pair_id_to_image_pair(pair_id)
+        if count >= MIN_VERIFIED and (a - 1, b - 1) in matched:
+            found[a - 1, b - 1] = count
+    return dict(sorted(found.items()))
 
 
 def describe_images(run: Run, features: RunFeatures) -> Float32Array:

@@ -20,6 +20,7 @@ from smust3r_colmap.colmap.reconstruction import cameras_of, poses_of
 from smust3r_colmap.features.guided_verification import MatchedFeatures, View, verify_guided
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.products import ImageCollection
 from smust3r_colmap.refinement.acceptance import MAX_ERROR_PX, report_of, try_step
 from smust3r_colmap.refinement.bundle_adjustment import (
@@ -276,11 +277,17 @@ class MapperSession:
             if image_id - 1 not in self.initial:
                 self.model.deregister_frame(self.model.image(image_id).frame_id)
             elif anchors:
-                near = min(anchors, key=lambda i: abs(i - image_id))
+                here = _centre(self.initial[image_id - 1])
+                near = min(anchors, key=lambda i: float(np.linalg.norm(_centre(self.initial[i - 1]) - here)))
                 near_from_world = self.model.image(near).cam_from_world()
                 old_near, old = (pycolmap.Rigid3d(self.initial[i - 1]) for i in (near, image_id))
                 pose = old * old_near.inverse() * near_from_world
                 self.model.frame(self.model.image(image_id).frame_id).rig_from_world = pose
+
+
+def _centre(cam_from_world: FloatArray) -> FloatArray:
+    centre: FloatArray = invert_rigid(cam_from_world)[:, 3]
+    return centre
 
 
 def redundant_points(model: pycolmap.Reconstruction) -> list[int]:

@@ -95,6 +95,8 @@ class InitialScenes:
         subsets: image indices of the segments, which are adjusted first in large models.
         maps: depth of the scenes; None if the model has none.
         maps_key: hash of all that the maps were made from.
+        view_graph: the order of the images.
+        pairs_of_others: pairs of images without a pose with those that see the same, so that they can be registered.
         surfaces: (S, 3) world points that each image sees, by image index; by default from the maps, or from the
             points of the scenes.
         tolerance: of the poses, as a fraction of the longer image side.
@@ -102,6 +104,8 @@ class InitialScenes:
 
     scenes: tuple[Scene, ...]
     subsets: tuple[tuple[int, ...], ...]
+    view_graph: ViewGraph
+    pairs_of_others: tuple[Pair, ...] = ()
     maps: DepthMaps | None = None
     maps_key: str = ""
     surfaces: Mapping[int, FloatArray] | None = None
@@ -111,7 +115,14 @@ class InitialScenes:
     def of(cls, stitched: Stitched, segments: Segments, *, maps_key: str) -> InitialScenes:
         """The scenes of stitching."""
         windows = tuple(window.images for window in segments.windows)
-        return cls(scenes=stitched.scenes, subsets=windows, maps=stitched.maps, maps_key=maps_key)
+        return cls(
+            scenes=stitched.scenes,
+            subsets=windows,
+            view_graph=segments.view_graph,
+            pairs_of_others=segments.pairs_of_others,
+            maps=stitched.maps,
+            maps_key=maps_key,
+        )
 
     @classmethod
     def of_external(
@@ -123,6 +134,7 @@ class InitialScenes:
         return cls(
             scenes=(scene,),
             subsets=tuple(window.images for window in windows),
+            view_graph=graph,
             surfaces=surfaces_of_clouds((scene,)) | dict(seen_by_tracks),
             tolerance=tolerance,
         )
@@ -173,8 +185,8 @@ def refine(
         features = None
     else:
         features = features or features_of_run(run, collection, feature_options)
-        pairs = _match(run, seen, features, options.track_neighbours)
-    map_pairs = () if source == "features" else _pairs_for_maps(seen, options.track_neighbours)
+        pairs = _match(run, initial, seen, features, options.track_neighbours)
+    map_pairs = () if source == "features" else _pairs_for_maps(initial, seen, options.track_neighbours)
     settings = (options, collection.calibrated, initial.tolerance)
     inputs = (METHOD_VERSION, features and features.key, pairs, initial.geometry, settings, initial.maps_key)
     stored = run.folder.stage(REFINED_STAGE, key=key_of(REFINED_STAGE, inputs))
@@ -254,30 +266,38 @@ def refine_external(
     raise InputError(f"{agreed} matches agree with the poses of the model, so no result is written, {hint}")
 
 
-def _match(run: Run, seen: Sequence[Sequence[SeenSurface]], features: RunFeatures, per_image: int) -> tuple[Pair, ...]:
+def _match(
+    run: Run,
+    initial: InitialScenes,
+    seen: Sequence[Sequence[SeenSurface]],
+    features: RunFeatures,
+    per_image: int,
+) -> tuple[Pair, ...]:
     """Match the pairs that see the same surface; returns all pairs that have been matched in the run."""
     with open_database(features.database) as database:
         pair_ids, _ = database.read_all_matches()
     known = {(a - 1, b - 1) for a, b in map(pycolmap.pair_id_to_image_pair, pair_ids)}
-    wanted = _wanted_pairs(run, seen, features, known, per_image)
-    return tuple(sorted(known | match_pairs_of_run(run, features, wanted, title="track matching")))
+    wanted = {*_wanted_pairs(run, initial, seen, features, known, per_image), *initial.pairs_of_others}
+    return tuple(sorted(known | match_pairs_of_run(run, features, sorted(wanted), title="track matching")))
 
 
 def _wanted_pairs(
     run: Run,
+    initial: InitialScenes,
     seen: Sequence[Sequence[SeenSurface]],
     features: RunFeatures,
     known: Collection[Pair],
     per_image: int,
 ) -> tuple[Pair, ...]:
     """Pairs beyond ``known`` that see the same surface; stored, because at a second start they are known, too."""
+    graph = initial.view_graph
 
     def compute(progress: Stage) -> tuple[Pair, ...]:
         # A backbone without features has matched nothing yet.
-        near = set() if known else _next_images(range(len(features.usable)))
+        near = set() if known else _next_images(graph)
         wanted = set(near)
         for surfaces in seen:
-            wanted |= set(select_pairs(surfaces, per_image=per_image, known=near or known))
+            wanted |= set(select_pairs(surfaces, per_image=per_image, known=near or known, around=graph.around))
             progress.advance()
         return tuple(sorted(wanted))
 
@@ -285,17 +305,17 @@ def _wanted_pairs(
     return run.cached("track_pairs", inputs, compute, _PAIRS, total=len(seen), title="track pairs")
 
 
-def _pairs_for_maps(seen: Sequence[Sequence[SeenSurface]], per_image: int) -> tuple[Pair, ...]:
+def _pairs_for_maps(initial: InitialScenes, seen: Sequence[Sequence[SeenSurface]], per_image: int) -> tuple[Pair, ...]:
     """Neighbours in order, and other images that see the same surface."""
-    pairs: set[Pair] = set()
+    graph = initial.view_graph
+    pairs = _next_images(graph)
     for surfaces in seen:
-        images = sorted(surface.image for surface in surfaces)
-        pairs |= _next_images(images) | set(select_pairs(surfaces, per_image=per_image, known=()))
+        pairs |= set(select_pairs(surfaces, per_image=per_image, known=(), around=graph.around))
     return tuple(sorted(pairs))
 
 
-def _next_images(images: Sequence[int]) -> set[Pair]:
-    return {(a, b) for step in range(1, NEXT_IMAGES + 1) for a, b in zip(images, images[step:], strict=False)}
+def _next_images(graph: ViewGraph) -> set[Pair]:
+    return {(a, b) for step in range(1, NEXT_IMAGES + 1) for a, b in graph.pairs_apart(step).tolist()}
 
 
 # --------------------------------------------------------------------------- results

@@ -47,7 +47,9 @@ def reconstruction(
 ) -> RunSummary:
     """What came out of ``pipeline.reconstruct``; also as ``summary.json``."""
     # Windows come first and have the last word.
-    reasons = {left.image: left.reason for one in reversed(result.reconstructions) for left in one.unregistered}
+    reasons = dict.fromkeys(segments.others, "no pose was found that its matches with keyframes agree with")
+    reasons |= dict.fromkeys(segments.unconnected, "matches too few other images")
+    reasons |= {left.image: left.reason for one in reversed(result.reconstructions) for left in one.unregistered}
     no_features = {one.name: one.reason for one in result.rejected}
     placed = _registered(fused)
     summary = RunSummary(

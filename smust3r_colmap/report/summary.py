@@ -139,7 +139,7 @@ class RunSummary:
                 f"the largest has {self.models[0].num_images} of {self.num_images} images"
             )
         empty = [
-            str(segment.index) for segment in self.segments if segment.kind == "window" and not segment.num_submodels
+            str(segment.index) for segment in self.segments if segment.kind != "loop" and not segment.num_submodels
         ]
         if empty:
             reasons.append(f"nothing came out of segment {', '.join(empty)}")

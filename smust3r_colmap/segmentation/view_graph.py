@@ -1,8 +1,7 @@
 """Which images may see the same place: pairs of images, each with a weight and a reason.
 
 A sequence gives the pairs of consecutive images; retrieval, and the user, add others. Segmentation, backbones,
-alignment and stitching ask here which images are neighbours, or how far apart they are in order. Refinement compares
-image indices itself, for pairs that no backbone matched and for poses that are put back.
+alignment and stitching ask here which images are neighbours, or how far apart they are in order.
 The next module to read is ``windows``.
 """
 
@@ -35,7 +34,8 @@ class ViewGraph:
     Args:
         num_images: of the collection.
         pairs: (E, 2) int64 indices into the collection, ``i < j`` in every row; rows ascend, without repeats.
-        weights: (E,) how alike the two are: the cosine of their descriptors, or 1 where order or the user says so.
+        weights: (E,) verified matches of the two where they have been matched; else the cosine of their descriptors, or
+            1 where order or the user says so.
         reasons: (E,) uint8, positions in ``REASONS``.
 
     Raises:
@@ -77,6 +77,16 @@ class ViewGraph:
             reasons=np.full(max(num_images - 1, 0), REASONS.index("order"), dtype=np.uint8),
         )
 
+    @classmethod
+    def without_pairs(cls, num_images: int) -> ViewGraph:
+        """The graph of images of which nothing is known."""
+        return cls(
+            num_images=num_images,
+            pairs=np.zeros((0, 2), dtype=np.int64),
+            weights=np.zeros(0),
+            reasons=np.zeros(0, dtype=np.uint8),
+        )
+
     def with_pairs(
         self, pairs: Sequence[Pair] | IntArray, reason: Reason, *, weights: npt.ArrayLike = 1.0
     ) -> ViewGraph:
@@ -109,6 +119,11 @@ class ViewGraph:
         return replace(self, pairs=self.pairs[kept], weights=self.weights[kept], reasons=self.reasons[kept])
 
     # --------------------------------------------------------------------------- pairs
+    @property
+    def tuples(self) -> tuple[Pair, ...]:
+        """The pairs, ascending."""
+        return tuple((i, j) for i, j in self.pairs.tolist())
+
     def neighbours(self, image: int) -> IntArray:
         """Images in a pair with this one, for whatever reason, ascending."""
         starts, others = self._adjacency
@@ -121,6 +136,11 @@ class ViewGraph:
         return bool(place < len(others) and others[place] == j)
 
     # --------------------------------------------------------------------------- order
+    @property
+    def is_ordered(self) -> bool:
+        """Whether any image has a next one."""
+        return bool(len(self._in_order))
+
     @property
     def sequences(self) -> tuple[IntArray, ...]:
         """The images of every sequence, in order; the sequence of the lowest image first."""

@@ -21,13 +21,14 @@ def plan_windows(graph: ViewGraph, *, segment_length: int, overlap: int) -> tupl
     images appended to a collection leave the finished windows as they are.
 
     Args:
-        graph: of at least 2 images; up to l images of a sequence make one segment.
+        graph: of at least 2 images; up to l images of a sequence make one segment. An image that is next to no other
+            is in none.
         segment_length: l, at least 2.
         overlap: p, from 1 to l - 1.
 
     Raises:
         ConfigError: l or p is outside these bounds.
-        CollectionError: fewer than 2 images, or an image is in no sequence.
+        CollectionError: fewer than 2 images.
     """
     if segment_length < 2:
         raise ConfigError(f"segment length {segment_length}: a segment needs at least 2 images")
@@ -39,9 +40,7 @@ def plan_windows(graph: ViewGraph, *, segment_length: int, overlap: int) -> tupl
     if graph.num_images < 2:
         raise CollectionError(f"{graph.num_images} usable images: a reconstruction needs at least 2")
     windows: list[tuple[int, ...]] = []
-    for images in (sequence.tolist() for sequence in graph.sequences):
-        if len(images) < 2:
-            raise CollectionError(f"image {images[0]} is next to no other in order: windows need sequences")
+    for images in (sequence.tolist() for sequence in graph.sequences if len(sequence) > 1):
         length = min(segment_length, len(images))
         last_start = len(images) - length
         starts = [*range(0, last_start, segment_length - overlap), last_start]

@@ -19,6 +19,7 @@ from smust3r_colmap.features.covisibility import (
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 
 WALL_Z = 4.0
 
@@ -31,6 +32,9 @@ def sees_wall(image: int, pose: FloatArray, wall_z: float = WALL_Z) -> SeenSurfa
     length = (wall_z - world_from_cam[2, 3]) / rays[:, 2]
     points = world_from_cam[:, 3] + length[:, None] * rays
     return SeenSurface(image=image, cam_from_world=pose, intrinsics=CAMERA, points_world=points[length > 0])
+
+
+around = ViewGraph.chain(30).around
 
 
 def walk_and_back(num_each: int) -> list[SeenSurface]:
@@ -84,14 +88,16 @@ def test_the_choice_does_not_depend_on_the_unit_of_length(scale: float) -> None:
         scaled.append(
             SeenSurface(image=one.image, cam_from_world=pose, intrinsics=CAMERA, points_world=one.points_world * scale)
         )
-    assert select_pairs(scaled, per_image=3, known=()) == select_pairs(surfaces, per_image=3, known=())
+    assert select_pairs(scaled, per_image=3, known=(), around=around) == select_pairs(
+        surfaces, per_image=3, known=(), around=around
+    )
 
 
 def test_choice_reaches_the_other_pass_when_neighbours_are_matched() -> None:
     n = 12
     surfaces = walk_and_back(n)
     known = {(a, b) for a in range(2 * n) for b in range(a + 1, min(a + 5, 2 * n))}
-    chosen = select_pairs(surfaces, per_image=1, known=known)
+    chosen = select_pairs(surfaces, per_image=1, known=known, around=around)
     assert not set(chosen) & known
     best = {image: {a + b - image for a, b in chosen if image in (a, b)} for image in range(n - 4)}
     for image, partners in best.items():
@@ -103,7 +109,7 @@ def test_pairs_ascend_are_new_and_at_most_so_many_of_each_image() -> None:
     surfaces = walk_and_back(12)
     known = {(0, 1), (3, 20), (4, 19)}
     for per_image in (1, 3):
-        chosen = select_pairs(surfaces, per_image=per_image, known=known)
+        chosen = select_pairs(surfaces, per_image=per_image, known=known, around=around)
         assert list(chosen) == sorted(set(chosen))
         assert all(a < b for a, b in chosen)
         assert not set(chosen) & known
@@ -115,17 +121,17 @@ def test_an_image_passes_over_what_is_next_in_order_to_its_partners() -> None:
     surfaces = walk_and_back(12)
     few = [surfaces[image] for image in (0, 1, 22, 23)]
     assert SAME_PLACE_IMAGES == 2
-    assert select_pairs([few[0], few[2]], per_image=4, known=()) == ((0, 22),)
-    assert select_pairs(few, per_image=4, known=[(0, 1), (0, 23), (1, 22), (22, 23)]) == ()
+    assert select_pairs([few[0], few[2]], per_image=4, known=(), around=around) == ((0, 22),)
+    assert select_pairs(few, per_image=4, known=[(0, 1), (0, 23), (1, 22), (22, 23)], around=around) == ()
 
 
 def test_images_that_see_nothing_are_paired_with_nothing() -> None:
     blind = SeenSurface(image=7, cam_from_world=straight(1)[0], intrinsics=CAMERA, points_world=np.empty((0, 3)))
-    chosen = select_pairs([*walk_and_back(2), blind], per_image=5, known=())
+    chosen = select_pairs([*walk_and_back(2), blind], per_image=5, known=(), around=around)
     assert chosen
     assert all(7 not in pair for pair in chosen)
-    assert select_pairs([blind], per_image=5, known=()) == ()
-    assert select_pairs([], per_image=5, known=()) == ()
+    assert select_pairs([blind], per_image=5, known=(), around=around) == ()
+    assert select_pairs([], per_image=5, known=(), around=around) == ()
 
 
 def test_points_behind_or_beyond_the_lens_model_do_no_harm() -> None:
@@ -138,7 +144,7 @@ def test_points_behind_or_beyond_the_lens_model_do_no_harm() -> None:
 
 def test_images_keep_their_indices_if_some_of_the_collection_are_missing() -> None:
     surfaces = [sees_wall(image, pose) for image, pose in zip((3, 10, 17), arc(3, angle=0.1), strict=True)]
-    assert set(select_pairs(surfaces, per_image=2, known=())) == {(3, 10), (3, 17), (10, 17)}
+    assert set(select_pairs(surfaces, per_image=2, known=(), around=around)) == {(3, 10), (3, 17), (10, 17)}
 
 
 @pytest.mark.parametrize(("count", "wanted"), [(0, 5), (1, 5), (5, 5), (6, 5), (1000, 7)])

@@ -18,6 +18,7 @@ from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.importers.image_folder import collection_from_scan, scan_image_folder
 from smust3r_colmap.refinement.stage import InitialScenes, Refinement, refine
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.storage.depth_maps import DepthMapWriter, StoredDepthMaps
 from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics
 
@@ -69,7 +70,10 @@ def refined(room: Room, output: Path, source: TrackSource) -> Refinement:
                 maps.write(f"{k}.png", depth, np.full(depth.shape, CONFIDENCE, np.float32))
             maps.finish()
         initial = InitialScenes(
-            scenes=(scene,), subsets=(tuple(posed),), maps=StoredDepthMaps(run.folder.work / "stitched")
+            scenes=(scene,),
+            subsets=(tuple(posed),),
+            view_graph=ViewGraph.chain(len(collection)),
+            maps=StoredDepthMaps(run.folder.work / "stitched"),
         )
         found = refine(run, initial, collection, None, RefinementConfig(track_source=source), FeatureConfig())
     assert found is not None

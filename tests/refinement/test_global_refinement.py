@@ -55,6 +55,7 @@ from smust3r_colmap.refinement.global_refinement import RefineTask, refine_scene
 from smust3r_colmap.refinement.mapper import redundant_points
 from smust3r_colmap.refinement.stage import InitialScenes, Refinement
 from smust3r_colmap.refinement.statistics import MIN_OBSERVATIONS, SceneRefinement, Statistics
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.storage.run_directory import StageFolder, read_json
 
 pytestmark = pytest.mark.usefixtures("quiet_pycolmap")
@@ -663,7 +664,12 @@ class Start:
     def refine(self, options: RefinementConfig | None = None, *, with_surfaces: bool = False) -> Refinement:
         """As the pipeline does it; without surfaces no new pairs are looked for."""
         seen = [self.world.points[rows[rows >= 0]] for rows in self.world.point_of]
-        initial = InitialScenes(scenes=self.scenes, subsets=(), surfaces=dict(enumerate(seen)) if with_surfaces else {})
+        initial = InitialScenes(
+            scenes=self.scenes,
+            subsets=(),
+            view_graph=ViewGraph.chain(len(self.world)),
+            surfaces=dict(enumerate(seen)) if with_surfaces else {},
+        )
         with quiet_run(self.output) as run:
             found = refine.refine(
                 run, initial, self.collection, self.features, options or RefinementConfig(), FeatureConfig()

@@ -53,6 +53,7 @@ from smust3r_colmap.refinement.principal_point import (
 )
 from smust3r_colmap.refinement.stage import InitialScenes
 from smust3r_colmap.refinement.statistics import SceneRefinement
+from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.storage.run_directory import StageFolder
 
 pytestmark = pytest.mark.usefixtures("quiet_pycolmap")
@@ -406,7 +407,7 @@ def test_setting_of_the_run_reaches_the_task(
     features = RunFeatures(
         database=tmp_path / "features.db", key="a test", usable=(True,) * len(one.collection), rejected=()
     )
-    initial = InitialScenes(scenes=one.scenes, subsets=(), surfaces={})
+    initial = InitialScenes(scenes=one.scenes, subsets=(), view_graph=ViewGraph.chain(len(one.collection)), surfaces={})
     with quiet_run(tmp_path / "out") as run:
         options = RefinementConfig(principal_point=wanted)
         refine.refine(run, initial, one.collection, features, options, FeatureConfig())

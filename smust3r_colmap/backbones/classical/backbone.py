@@ -128,6 +128,8 @@ class ClassicalBackbone:
         self, segment: Segment, view_graph: ViewGraph, descriptors: npt.NDArray[np.float32] | None
     ) -> tuple[Pair, ...]:
         neighbours = self.config.match_neighbours
+        if segment.kind == "cluster":
+            return view_graph.within(segment.images).tuples
         if segment.kind == "loop":
             assert descriptors is not None, "loops are found by descriptors"
             return plan_loop_pairs(view_graph.runs(segment.images), descriptors, neighbours=neighbours)
@@ -145,7 +147,7 @@ class ClassicalBackbone:
         if self.collection.calibrated:
             mapped = self._map_all("mapping", list(tasks.values()))
             return [mapped[segment.index] for segment in segments]
-        windows = [tasks[segment.index] for segment in segments if segment.kind == "window"]
+        windows = [tasks[segment.index] for segment in segments if segment.kind != "loop"]
         mapped = self._self_calibrated(windows)
         known = self._agreed_cameras(segments, mapped)
         rest = [
@@ -243,9 +245,9 @@ class ClassicalBackbone:
 
         A camera of one window alone is not used for other windows, but for the loops with this window.
         """
-        windows = [free[segment.index] for segment in segments if segment.kind == "window" and segment.index in free]
+        windows = [free[segment.index] for segment in segments if segment.kind != "loop" and segment.index in free]
         camera_of_image = [image.camera for image in self.collection.images]
-        least: dict[SegmentKind, int] = {"window": 2, "loop": 1}
+        least: dict[SegmentKind, int] = {"window": 2, "cluster": 2, "loop": 1}
         return {
             kind: agree_on_cameras(windows, camera_of_image, self.collection.cameras, min_models=count)
             for kind, count in least.items()
@@ -262,6 +264,7 @@ class ClassicalBackbone:
             cameras=self.collection.cameras,
             known_cameras=dict(enumerate(self.collection.cameras)) if self.collection.calibrated else {},
             seed=self.run.seed,
+            in_order=segment.kind != "cluster",
         )
 
     def _finish(

@@ -27,10 +27,12 @@ from smust3r_colmap.backbones.classical.mapped_model import (
 )
 from smust3r_colmap.backbones.classical.model_checks import (
     diverged_focal,
+    find_contradicted_images,
     find_epipolar_outliers,
     find_unconfirmed_poses,
     find_weak_links,
     implausible_focal,
+    strongly_linked_parts,
 )
 from smust3r_colmap.backbones.classical.strategies import (
     MapperOutput,
@@ -184,11 +186,11 @@ class SegmentMapper:
             )
             models = others if others_better else models
         outliers = sum(len(self._epipolar_outliers(model)) for model in models)
-        weak_links = sum(len(find_weak_links(model)) for model in models)
+        weak_links = sum(self._num_weak_links(model) for model in models)
         if outliers or weak_links:
             notes.append(f"{name}: split at {outliers} epipolar outliers and {weak_links} weak links")
             models = [part for model in models for part in self._split(model)]
-        if outliers and strategy.retry_with_near_pairs:
+        if outliers and strategy.retry_with_near_pairs and self.task.in_order:
             parts = self._mapped_with_near_pairs(name)
             if len(placed_images(parts)) >= len(placed_images(models)):
                 notes.append(f"{name}: mapped again with near pairs only")
@@ -262,15 +264,31 @@ class SegmentMapper:
             )
 
     def _epipolar_outliers(self, model: MappedModel) -> list[int]:
+        """Of a sequence, positions after which it breaks; of a cluster, images that do not belong."""
         with open_database(self.task.database) as database:
+            if not self.task.in_order:
+                return find_contradicted_images(model, self.inliers, database)
             return find_epipolar_outliers(model, self.task.view_graph, self.inliers, database)
+
+    def _num_weak_links(self, model: MappedModel) -> int:
+        return len(find_weak_links(model)) if self.task.in_order else len(strongly_linked_parts(model)) - 1
 
     def _split(self, model: MappedModel) -> list[MappedModel]:
         """The parts of a model between epipolar outliers and weak links, those that are large enough."""
+        if not self.task.in_order:
+            return self._split_cluster(model)
         breaks = sorted({*self._epipolar_outliers(model), *find_weak_links(model)})
         bounds = [0, *[k + 1 for k in breaks], len(model.images)]
         parts = [range(a, b) for a, b in pairwise(bounds) if b - a >= self.task.min_model_images]
         return [model] if len(bounds) == 2 else [restrict_model(model, part) for part in parts]
+
+    def _split_cluster(self, model: MappedModel) -> list[MappedModel]:
+        outliers = self._epipolar_outliers(model)
+        rest = restrict_model(model, [k for k in range(len(model.images)) if k not in outliers]) if outliers else model
+        parts = strongly_linked_parts(rest)
+        if len(parts) == 1:
+            return [rest]
+        return [restrict_model(rest, part) for part in parts if len(part) >= self.task.min_model_images]
 
     def _converted(self, output: MapperOutput, method: str) -> list[MappedModel]:
         converted = [model_from_reconstruction(model, method) for model in output.models.values()]

@@ -6,12 +6,15 @@ The next module to read is ``strategies``.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 import pycolmap
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from smust3r_colmap.backbones.classical.mapped_model import MappedModel
 from smust3r_colmap.geometry.arrays import Pair
@@ -141,6 +144,42 @@ def find_weak_links(model: MappedModel) -> list[int]:
     np.minimum.at(first, tracks.point_of_observation, position)
     np.maximum.at(last, tracks.point_of_observation, position)
     return [k for k in range(len(model.images) - 1) if np.count_nonzero((first <= k) & (last > k)) < MIN_LINK_POINTS]
+
+
+def strongly_linked_parts(model: MappedModel) -> list[list[int]]:
+    """Positions of the images that hang together by pairs with MIN_LINK_POINTS common points, largest part first."""
+    tracks = model.tracks
+    n = len(model.images)
+    position = np.searchsorted(model.images, tracks.image_of_observation)
+    seen = csr_array(
+        (np.ones(len(position), dtype=np.int64), (position, tracks.point_of_observation)),
+        shape=(n, len(tracks.points_seg)),
+    )
+    common = csr_array(seen @ seen.T)
+    common.data[common.data < MIN_LINK_POINTS] = 0
+    common.eliminate_zeros()
+    _, label = connected_components(common, directed=False)
+    parts = [np.flatnonzero(label == k).tolist() for k in range(int(label.max(initial=-1)) + 1)]
+    return sorted(parts, key=lambda part: -len(part))
+
+
+def find_contradicted_images(model: MappedModel, inliers: Mapping[Pair, int], database: pycolmap.Database) -> list[int]:
+    """Positions of the images that most of their pairs with STRONG_PAIR_INLIERS contradict, in whatever order they are.
+
+    A pair contradicts a model where less than MIN_EPIPOLAR_INLIER_SHARE of its matches lie near their epipolar lines.
+
+    Args:
+        inliers: verified matches by pair. database: with the keypoints and the two-view geometries.
+    """
+    position = {image: k for k, image in enumerate(model.images)}
+    contradicts: dict[int, list[bool]] = defaultdict(list)
+    for (first, second), count in inliers.items():
+        if count >= STRONG_PAIR_INLIERS and first in position and second in position:
+            a, b = position[first], position[second]
+            bad = epipolar_inlier_share(model, a, b, database) < MIN_EPIPOLAR_INLIER_SHARE
+            contradicts[a].append(bad)
+            contradicts[b].append(bad)
+    return sorted(k for k, pairs in contradicts.items() if np.mean(pairs) > 0.5)
 
 
 def find_epipolar_outliers(

@@ -41,6 +41,7 @@ class MappingTask:
             segment are known.
         seed: of pycolmap's samplers.
         use_global: the global mapper may be used; not after it aborted the process.
+        in_order: images that follow each other in ``images`` are neighbours; not in a cluster.
     """
 
     segment: int
@@ -53,6 +54,7 @@ class MappingTask:
     known_cameras: Mapping[int, Intrinsics]
     seed: int
     use_global: bool = True
+    in_order: bool = True
 
     @property
     def camera_of(self) -> dict[int, int]:

@@ -199,7 +199,14 @@ class Must3rPredictor:
     def key(self) -> object:
         """See ``Predictor``. How much memory is free is not in it: what was predicted stays."""
         s = self.settings
-        choice = (s.keyframes, s.max_keyframes, s.keyframe_interval, s.keyframe_threshold, s.refinements, s.rerender)
+        choice = (
+            s.network_keyframes,
+            s.max_keyframes,
+            s.keyframe_interval,
+            s.keyframe_threshold,
+            s.refinements,
+            s.rerender,
+        )
         return self._encoding_key, choice, s.camera_fit, self._head_key, self.collection.calibrated
 
     # -------------------------------------------------------------------------- every image
@@ -317,7 +324,7 @@ class Must3rPredictor:
             tokens=max(window.width * window.height for window in windows) // patch**2,
             dtype=network.dtype,
             weights_bytes=bytes_of_weights(network.encoder, network.decoder) if mapped else 0,
-            remakes_memory=settings.keyframes == "overlap",
+            remakes_memory=settings.network_keyframes == "overlap",
             shown_again=2 if settings.refinements else 1,
         )
         return plan_memory(
@@ -358,7 +365,7 @@ class Must3rPredictor:
 
     def _choice(self, most: int, images: Sequence[EncodedImage]) -> KeyframeChoice:
         settings = self.settings
-        match settings.keyframes:
+        match settings.network_keyframes:
             case "linspace":
                 return EvenlySpread(most=most)
             case "retrieval":

@@ -337,7 +337,7 @@ def test_whatever_changes_a_prediction_changes_its_key(predictor: Callable[..., 
     usual = predictor().key
     assert predictor().key == usual
     changes: list[dict[str, Any]] = [
-        {"keyframes": "every-kth"},
+        {"network_keyframes": "every-kth"},
         {"max_keyframes": 7},
         {"refinements": 1},
         {"rerender": False},
