@@ -18,7 +18,7 @@ from smust3r_colmap.importers.image_scan import RECORDS, is_of_another_version, 
 from smust3r_colmap.importers.masks import MaskSet, check_masks
 from smust3r_colmap.products import DepthMaps, Scene
 from smust3r_colmap.storage.codec import Codec
-from smust3r_colmap.storage.depth_maps import StoredDepthMaps
+from smust3r_colmap.storage.depth_maps import depth_maps_of_run
 from smust3r_colmap.storage.digest import digest_of
 from smust3r_colmap.storage.run_directory import (
     DATABASE_FILE,
@@ -27,7 +27,6 @@ from smust3r_colmap.storage.run_directory import (
     MODEL_FOLDER,
     REFINED_STAGE,
     SCENE_STAGE,
-    STITCHED_STAGE,
     RunDirectory,
     read_json,
     storage_errors,
@@ -155,7 +154,7 @@ def open_finished(run: RunDirectory, *, images: Path | None = None, output: Path
         scenes=tuple(one.scene for one in FUSED_SCENES.read(run.work / SCENE_STAGE)),
         models=tuple(refined / str(k) / MODEL_FOLDER if has else None for k, has in enumerate(parts.with_tracks)),
         database=refined / DATABASE_FILE if any(parts.with_tracks) else None,
-        maps=StoredDepthMaps(run.work / STITCHED_STAGE) if parts.with_maps else None,
+        maps=depth_maps_of_run(run.work) if parts.with_maps else None,
         masks=parts.masks,
         timestamps_s=parts.timestamps_s,
         bits=bits_in_use(RECORDS.read(run.work / IMPORT_STAGE)),

@@ -73,6 +73,7 @@ def reconstruct(
         initial = refinement.InitialScenes.of(stitched, segments, maps_key=submodels.dense_key)
         refined = refinement.refine(run, initial, collection, submodels.features, config.refinement, config.features)
         fused = dense.fuse(run, submodels, segments, stitched, refined, config.fusion)
+        initial = dense.with_depth_of_others(run, initial, segments, refined)
         outputs = exporters.export(
             run, fused, refined, initial, source.folder, collection, config, before=stitched.before
         )

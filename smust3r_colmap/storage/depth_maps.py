@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from smust3r_colmap.storage.run_directory import read_array, read_json, write_arrays, write_json
+from smust3r_colmap.products import DepthMaps
+from smust3r_colmap.storage.run_directory import (
+    CARRIED_DEPTH_STAGE,
+    STITCHED_STAGE,
+    read_array,
+    read_json,
+    write_arrays,
+    write_json,
+)
 
 _NAMES = "depth_names.json"
 
@@ -39,6 +48,35 @@ class DepthMapWriter:
     def finish(self) -> None:
         """Say which file is whose."""
         write_json(self._folder / _NAMES, list(self._number))
+
+
+@dataclass(frozen=True)
+class JoinedDepthMaps:
+    """The maps of two stages, of different images; implements ``DepthMaps``."""
+
+    first: DepthMaps
+    second: DepthMaps
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.first or name in self.second
+
+    def depth(self, name: str) -> npt.NDArray[np.float32]:
+        """See ``DepthMaps``."""
+        return self._of(name).depth(name)
+
+    def confidence(self, name: str) -> npt.NDArray[np.float32]:
+        """See ``DepthMaps``."""
+        return self._of(name).confidence(name)
+
+    def _of(self, name: str) -> DepthMaps:
+        return self.first if name in self.first else self.second
+
+
+def depth_maps_of_run(work: Path) -> DepthMaps:
+    """The maps of a finished run: those of stitching, and those carried over to images that are no keyframes."""
+    stitched = StoredDepthMaps(work / STITCHED_STAGE)
+    carried = work / CARRIED_DEPTH_STAGE
+    return JoinedDepthMaps(stitched, StoredDepthMaps(carried)) if carried.exists() else stitched
 
 
 class StoredDepthMaps:

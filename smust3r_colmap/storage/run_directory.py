@@ -15,13 +15,16 @@
         import/            what was read of each file
         features/          database.db: keypoints, descriptors, matches, ids = index + 1; static_regions
         descriptors/       one vector per image
+        keyframes/         images that carry the reconstruction
         loops/             every candidate for a loop, why it was taken or not, the loop segments
+        cover/             clusters of images in no order
         tokens/            images as the MUSt3R network encoded them; the least recently used give way
         segments/0000/     mapping/  calibrated/  depth_0/  depth_1/ ..., or the prediction of a network
         alignment/         edges between the submodels
         stitched/          cameras as stitching placed them, one depth map per image
         track_pairs/       image pairs that the stitched geometry suggests for tracks
         refined/           0/model  1/model ...  database.db  refinements.json
+        carried_depth/     one depth map per image that is no keyframe
         scene/             the adjusted cameras and fused clouds, before they are exported
         finished.json      when all stages stand: which of them belong together, and where the images are
 
@@ -53,6 +56,7 @@ from smust3r_colmap.storage.atomic_write import write_atomically
 from smust3r_colmap.storage.digest import digest_of
 
 IMPORT_STAGE, STITCHED_STAGE, REFINED_STAGE, SCENE_STAGE = "import", "stitched", "refined", "scene"
+CARRIED_DEPTH_STAGE = "carried_depth"
 """Folders below ``work`` that are read again when a finished run is exported."""
 FRAMES_STAGE = "frames"
 """Below ``work``: for each set of videos a folder of images."""
