@@ -1,0 +1,101 @@
+"""Whole runs on collections that are no evenly paced walk: names in no order, two rooms with strangers, a slow film."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from smust3r_colmap.config import (
+    ClassicalConfig,
+    FeatureConfig,
+    FusionConfig,
+    OutputConfig,
+    RunConfig,
+    SegmentationConfig,
+)
+from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse
+from smust3r_colmap.evaluation.trajectory import compare_trajectories
+from smust3r_colmap.execution.progress import QuietReporter
+from smust3r_colmap.pipeline import reconstruct
+from smust3r_colmap.report.summary import RunSummary
+from smust3r_colmap.storage.depth_maps import depth_maps_of_run
+from smust3r_colmap.synthetic.room import write_demo
+
+pytestmark = pytest.mark.slow
+
+CONFIG = RunConfig(
+    workers=1,
+    segmentation=SegmentationConfig(segment_length=18, overlap=8, retrieval_neighbours=10),
+    features=FeatureConfig(max_features=1200),
+    classical=ClassicalConfig(dense_size=160, depth_planes=32),
+    fusion=FusionConfig(max_points=20_000),
+    output=OutputConfig(trainer=False, dense=False),
+)
+NUM_IMAGES = 48
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("room")
+    write_demo(folder, num_images=NUM_IMAGES, width=320, height=240)
+    return folder
+
+
+def run(images: Path, output: Path, config: RunConfig = CONFIG) -> RunSummary:
+    return reconstruct(images, output, config, reporter=QuietReporter(sys.stderr))
+
+
+def shuffled(room: Path, folder: Path, *, seed: int) -> dict[str, str]:
+    """Copies under names in no order; the old name by the new one."""
+    folder.mkdir(exist_ok=True)
+    paths = sorted((room / "images").iterdir())
+    old_names = {}
+    for number, k in enumerate(np.random.default_rng(seed).permutation(len(paths))):
+        name = f"{seed}_{number:03d}{paths[k].suffix}"
+        shutil.copy(paths[k], folder / name)
+        old_names[name] = paths[k].name
+    return old_names
+
+
+def test_images_in_no_order_give_the_model_of_the_walk(room: Path, tmp_path: Path) -> None:
+    old_names = shuffled(room, tmp_path / "images", seed=1)
+    summary = run(tmp_path / "images", tmp_path / "out")
+    assert {segment.kind for segment in summary.segments} == {"cluster"}
+    assert len(summary.segments) > 2
+    assert (summary.num_registered, len(summary.models), summary.exit_code) == (NUM_IMAGES, 1, 0)
+    found = {old_names[name]: pose for name, pose in read_reference_sparse(tmp_path / "out/sparse/0").items()}
+    distance = compare_trajectories(found, read_poses_txt(room / "poses.txt"))
+    assert 0 < distance.position_rmse < 0.02
+    again = run(tmp_path / "images", tmp_path / "out")
+    assert all(stage.reused for stage in again.stages if stage.name in ("cover", "mapping", "alignment", "refinement"))
+
+
+def test_strangers_in_no_order_are_left_out_by_name(room: Path, tmp_path: Path) -> None:
+    shuffled(room, tmp_path / "images", seed=1)
+    rng = np.random.default_rng(3)
+    for k in range(3):
+        blobs = cv2.resize(rng.integers(0, 255, size=(24, 32, 3), dtype=np.uint8), (320, 240))
+        cv2.imwrite(str(tmp_path / f"images/0_stranger{k}.png"), blobs)
+    summary = run(tmp_path / "images", tmp_path / "out")
+    assert {note.name for note in summary.unregistered} == {f"0_stranger{k}.png" for k in range(3)}
+    assert [model.num_images for model in summary.models] == [NUM_IMAGES]
+
+
+def test_frames_between_keyframes_get_pose_and_depth(room: Path, tmp_path: Path) -> None:
+    settings = replace(CONFIG.segmentation, keyframes=NUM_IMAGES // 2)
+    summary = run(room / "images", tmp_path / "out", replace(CONFIG, segmentation=settings))
+    in_segments = sum(segment.num_images for segment in summary.segments if segment.kind == "window")
+    assert in_segments < NUM_IMAGES
+    assert (summary.num_registered, len(summary.models), summary.exit_code) == (NUM_IMAGES, 1, 0)
+    truth = read_poses_txt(room / "poses.txt")
+    distance = compare_trajectories(read_reference_sparse(tmp_path / "out/sparse/0"), truth)
+    assert 0 < distance.position_rmse < 0.02
+    maps = depth_maps_of_run(tmp_path / "out/work")
+    covered = [float((maps.depth(name) > 0).mean()) for name in truth]
+    assert min(covered) > 0.25
