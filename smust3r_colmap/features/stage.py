@@ -12,11 +12,14 @@ import pycolmap
 
 from smust3r_colmap.colmap.database import create_database, open_database
 from smust3r_colmap.config import FeatureConfig
+from smust3r_colmap.errors import ReconstructionError
 from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.execution.run_context import Run
+from smust3r_colmap.execution.task_pool import TaskFailure, in_child
 from smust3r_colmap.features.guided_verification import MIN_VERIFIED
 from smust3r_colmap.features.matching import drop_matches_without_evidence, find_static_parts, match_pairs
 from smust3r_colmap.features.pairs import alike_pairs, neighbouring_pairs
+from smust3r_colmap.features.rotation_consistency import MAX_ROTATION_ERROR_DEG, RotationTask, rotation_errors_deg
 from smust3r_colmap.features.sift import extract_features
 from smust3r_colmap.features.stationary import NO_REGIONS, StaticRegions, describe
 from smust3r_colmap.features.vlad import FEATURES_PER_IMAGE, vlad_descriptors
@@ -27,6 +30,7 @@ from smust3r_colmap.storage.run_directory import key_of
 
 _STATIC_REGIONS: Codec[StaticRegions] = Codec(StaticRegions, "static_regions")
 """Beside the database of the features."""
+_PAIRS: Codec[tuple[Pair, ...]] = Codec(tuple[Pair, ...], "pairs")
 _DESCRIPTORS: Codec[Float32Array] = Codec(Float32Array, "descriptors")
 
 
@@ -99,6 +103,39 @@ def verified_pairs(run: Run, features: RunFeatures, pairs: Iterable[Pair], *, ti
         if count >= MIN_VERIFIED and (a - 1, b - 1) in matched:
             found[a - 1, b - 1] = count
     return dict(sorted(found.items()))
+
+
+def look_alike_pairs(
+    run: Run, features: RunFeatures, collection: ImageCollection, pairs: Iterable[Pair]
+) -> tuple[Pair, ...]:
+    """Verified pairs whose relative rotation the others contradict, ascending; see ``rotation_consistency``."""
+    tested = tuple(sorted(pairs))
+    task = RotationTask(
+        database=features.database,
+        pairs=tested,
+        cameras={k: collection.cameras[image.camera] for k, image in enumerate(collection.images)},
+        seed=run.seed,
+    )
+
+    def compute(progress: Stage) -> tuple[Pair, ...]:
+        errors_deg = in_child(rotation_errors_deg, task, log_file=run.folder.native_log)
+        progress.advance()
+        if isinstance(errors_deg, TaskFailure):
+            raise ReconstructionError(errors_deg.reason)
+        return tuple(tested[k] for k in np.flatnonzero(errors_deg > MAX_ROTATION_ERROR_DEG))
+
+    try:
+        found = run.cached("look_alikes", (features.key, tested, run.seed), compute, _PAIRS, title="look-alikes")
+    except ReconstructionError as error:  # not stored, so that the next start tries again
+        run.clock.warn(f"look-alike places were not looked for: {error}")
+        return ()
+    if found:
+        one, other = (collection.images[k].name for k in found[0])
+        run.clock.note(
+            f"{len(found)} of {len(tested)} pairs are left out as look-alikes, such as {one} and {other}: the "
+            "rotations of all other pairs contradict theirs"
+        )
+    return found
 
 
 def describe_images(run: Run, features: RunFeatures) -> Float32Array:

@@ -15,7 +15,7 @@ from smust3r_colmap.errors import CollectionError
 from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.features.pairs import alike_pairs, further_pairs, near_pairs
-from smust3r_colmap.features.stage import features_of_run, verified_pairs
+from smust3r_colmap.features.stage import features_of_run, look_alike_pairs, verified_pairs
 from smust3r_colmap.geometry.arrays import Float32Array, Pair
 from smust3r_colmap.products import ImageCollection, RunFeatures, Segment
 from smust3r_colmap.segmentation.cover import MIN_COMPONENT_IMAGES, Cover, plan_cover
@@ -188,6 +188,7 @@ def _of_view_graph(
     graph = verified_view_graph(
         run,
         features,
+        collection,
         sequences=[sequence.tolist() for sequence in chain.sequences],
         descriptors=_without(describe(), others),
         near=config.classical.match_neighbours,
@@ -218,6 +219,7 @@ def _of_view_graph(
 def verified_view_graph(
     run: Run,
     features: RunFeatures,
+    collection: ImageCollection,
     *,
     sequences: Sequence[Sequence[int]],
     descriptors: Float32Array,
@@ -226,6 +228,8 @@ def verified_view_graph(
     exhaustive_below: int,
 ) -> ViewGraph:
     """The pairs that have enough verified matches, of those that order and likeness suggest, and their partners.
+
+    Without look-alikes, whose rotation all others contradict.
 
     Args:
         sequences: images that follow each other; near ones are matched.
@@ -244,6 +248,8 @@ def verified_view_graph(
         f"view graph: {len(in_order)} pairs by order, {len(likely)} by likeness, {len(more)} by common partners; "
         f"{len(verified)} have verified matches"
     )
+    for pair in look_alike_pairs(run, features, collection, verified):
+        del verified[pair]
     graph = ViewGraph.without_pairs(len(features.usable))
     steps = {(a, b) for sequence in sequences for a, b in pairwise(sequence)} & verified.keys()
     by_reason: dict[Reason, Collection[Pair]] = {"order": steps, "retrieval": verified.keys() - steps}

@@ -17,6 +17,7 @@
         descriptors/       one vector per image
         keyframes/         images that carry the reconstruction
         loops/             every candidate for a loop, why it was taken or not, the loop segments
+        look_alikes/       pairs that the rotations of all others contradict
         cover/             clusters of images in no order
         tokens/            images as the MUSt3R network encoded them; the least recently used give way
         segments/0000/     mapping/  calibrated/  depth_0/  depth_1/ ..., or the prediction of a network
