@@ -30,7 +30,8 @@ def looking_out(k: int) -> np.ndarray:
 def in_front(cam_from_world: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """(NUM_POINTS, 3) of the world, before a camera."""
     points_cam = rng.uniform((-1, -1, 5), (1, 1, 9), size=(NUM_POINTS, 3))
-    return (points_cam - cam_from_world[:, 3]) @ cam_from_world[:, :3]
+    points_world: np.ndarray = (points_cam - cam_from_world[:, 3]) @ cam_from_world[:, :3]
+    return points_world
 
 
 def seen(cam_from_world: np.ndarray, points_world: np.ndarray) -> np.ndarray:
