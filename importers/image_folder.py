@@ -198,11 +198,11 @@ def _list_folder(folder: Path) -> _Listing:
         suffix = PurePosixPath(name).suffix.lower()
         if not problem and suffix in UNREAD_SUFFIXES:
             reason = f"images of kind {suffix} are not read; convert it to JPEG, PNG or 16-bit TIFF"
-            unreadable.append(RejectedImage(name=_printable(name), reason=reason))
+            unreadable.append(RejectedImage(name=printable(name), reason=reason))
         elif not problem and suffix not in SUFFIXES:
             other_suffixes[suffix] += 1
-        elif reason := problem or _unusable_entry(folder, name):
-            unreadable.append(RejectedImage(name=_printable(name), reason=reason))
+        elif reason := problem or unusable_entry(folder, name):
+            unreadable.append(RejectedImage(name=printable(name), reason=reason))
         else:
             names.append(name)
     names.sort(key=natural_key)
@@ -240,16 +240,16 @@ def walk(folder: Path) -> Iterator[tuple[str, str]]:
                 pending.appendleft(here / entry.name)
 
 
-def _unusable_entry(folder: Path, name: str) -> str:
+def unusable_entry(folder: Path, name: str) -> str:
     """Why a file is not even opened; empty when it may be."""
     if not os.path.isfile(folder / name):
         return "no regular file, or a link to nothing"
-    if _printable(name) != name:
+    if printable(name) != name:
         return "the file name is not valid UTF-8 or has control characters; rename it"
     return ""
 
 
-def _printable(name: str) -> str:
+def printable(name: str) -> str:
     """The name with bytes that are no UTF-8, and control characters, written as escapes."""
     text = os.fsencode(name).decode("utf-8", "backslashreplace")
     return "".join(f"\\x{ord(char):02x}" if unicodedata.category(char) == "Cc" else char for char in text)

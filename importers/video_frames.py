@@ -20,7 +20,7 @@ from PIL import Image
 from smust3r_colmap.errors import CollectionError, VideoError
 from smust3r_colmap.importers.frame_selection import choose_frames
 from smust3r_colmap.importers.frame_times import COLUMNS, FRAMES_FILE
-from smust3r_colmap.importers.image_folder import natural_key, walk
+from smust3r_colmap.importers.image_folder import natural_key, printable, unusable_entry, walk
 from smust3r_colmap.importers.images import SUFFIXES
 from smust3r_colmap.importers.video import VIDEO_SUFFIXES, open_video
 from smust3r_colmap.products import RejectedImage
@@ -51,7 +51,7 @@ class FoundFiles:
     Args:
         videos: in natural order.
         images: names of all other files that an import reads, and of folders that cannot be read.
-        left_out: films of Live Photos.
+        left_out: films of Live Photos, and videos with names that cannot be used.
     """
 
     videos: tuple[VideoFile, ...]
@@ -65,10 +65,15 @@ def is_video(path: Path) -> bool:
 
 
 def find_files(source: Path) -> FoundFiles:
-    """The videos and images of a folder, or a video alone."""
+    """The videos and images of a folder, or a video alone.
+
+    Raises:
+        CollectionError: a video alone has a name that cannot be used.
+    """
     if source.is_file():
         return FoundFiles(videos=name_folders([source]), images=(), left_out=())
     names, images = list[str](), list[str]()
+    reasons = dict[str, str]()
     for name, problem in walk(source):
         suffix = PurePosixPath(name).suffix.lower()
         if not problem and suffix in VIDEO_SUFFIXES:
@@ -76,14 +81,17 @@ def find_files(source: Path) -> FoundFiles:
         elif problem or suffix in SUFFIXES or PurePosixPath(name).name == FRAMES_FILE:
             images.append(name)
     stems = {_stem(name) for name in images}
+    for name in names:
+        if reason := unusable_entry(source, name):
+            reasons[name] = reason
+        elif _stem(name) in stems:
+            reasons[name] = "a photograph beside it has its name: the film of a Live Photo"
     taken = {str(parent).casefold() for name in images for parent in PurePosixPath(name).parents}
-    live = [name for name in names if _stem(name) in stems]
     return FoundFiles(
-        videos=_with_folders([(source / name, name) for name in names if name not in live], taken),
+        videos=_with_folders([(source / name, name) for name in names if name not in reasons], taken),
         images=tuple(images),
         left_out=tuple(
-            RejectedImage(name=name, reason="a photograph beside it has its name: the film of a Live Photo")
-            for name in sorted(live, key=natural_key)
+            RejectedImage(name=printable(name), reason=reasons[name]) for name in sorted(reasons, key=natural_key)
         ),
     )
 
@@ -92,9 +100,12 @@ def name_folders(paths: Iterable[Path]) -> tuple[VideoFile, ...]:
     """Videos of any place, each with a folder for its frames.
 
     Raises:
-        CollectionError: two have the same file name.
+        CollectionError: two have the same file name, or one has a name that cannot be used.
     """
     named = [(path, path.name) for path in paths]
+    for path, name in named:
+        if reason := unusable_entry(path.parent, name):
+            raise CollectionError(f"{printable(name)}: {reason}")
     for name, count in Counter(name for _, name in named).items():
         if count > 1:
             raise CollectionError(f"{name}: {count} videos have this name; rename them, for their frames need names")

@@ -143,9 +143,23 @@ def test_films_of_live_photos_are_left_out(tmp_path: Path) -> None:
     assert "Live Photo" in found.left_out[0].reason
 
 
+def test_names_that_cannot_be_used_are_left_out_or_refused(tmp_path: Path) -> None:
+    name = os.fsdecode(b"caf\xe9.mp4")
+    (tmp_path / name).touch()
+    (tmp_path / "gone.mp4").symlink_to(tmp_path / "nowhere.mp4")
+    found = find_files(tmp_path)
+    assert found.videos == ()
+    assert {one.name: one.reason.partition(";")[0] for one in found.left_out} == {
+        "caf\\xe9.mp4": "the file name is not valid UTF-8 or has control characters",
+        "gone.mp4": "no regular file, or a link to nothing",
+    }
+    with pytest.raises(CollectionError, match=r"caf\\xe9\.mp4: the file name is not valid UTF-8"):
+        find_files(tmp_path / name)
+
+
 def test_videos_of_one_name_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CollectionError, match=r"clip\.mp4: 2 videos have this name"):
-        name_folders([tmp_path / "a/clip.mp4", tmp_path / "b/clip.mp4"])
+        name_folders([clip(tmp_path / "a/clip.mp4", 1), clip(tmp_path / "b/clip.mp4", 1)])
 
 
 # ----------------------------------------------------------------------------------- stage
