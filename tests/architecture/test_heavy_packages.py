@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
 from show_structure import PACKAGE, modules
 
 WITH_TORCH = tuple(f"{PACKAGE}.{name}" for name in ("backbones.must3r", "backbones.vggt", "synthetic.must3r_weights"))
@@ -18,6 +19,7 @@ print("LOADED", sorted({"torch", "open3d"} & set(sys.modules)))
 """
 
 
+@pytest.mark.slow
 def test_no_module_but_the_networks_imports_torch_or_open3d() -> None:
     names = [name for name in sorted(modules()) if not name.startswith(WITH_TORCH) and not name.endswith("__main__")]
     child = subprocess.run([sys.executable, "-c", PROGRAM, *names], capture_output=True, text=True, check=True)

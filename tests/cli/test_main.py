@@ -372,6 +372,7 @@ def test_scales_are_given_with_commas_or_blanks(words: list[str]) -> None:
     assert settings_of("--trainer-scales", *words).output.trainer_scales == (2, 4, 8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [RECONSTRUCT, ["refine", "model", "--images", "photos"]])
 def test_the_same_switches_have_the_same_spelling_and_default(command: list[str]) -> None:
     def output_of(*words: str) -> ModelOutputConfig:
@@ -732,6 +733,7 @@ def _small_doctor(monkeypatch: pytest.MonkeyPatch, packages: tuple[tuple[str, st
     monkeypatch.setattr(doctor, "list_backbones", tuple)
 
 
+@pytest.mark.slow
 def test_doctor_survives_packages_that_abort_hang_or_are_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -129,6 +129,7 @@ def edited(edit: Callable[[World], None]) -> World:
     return world
 
 
+@pytest.mark.slow
 def test_pixels_below_the_confidence_are_left_out() -> None:
     def doubt_the_left_half(world: World) -> None:
         for maps in world.dense:

@@ -119,6 +119,7 @@ def test_points_are_triangulated_anew_without_moving_a_camera(
     assert 0.05 < found.compute_mean_reprojection_error() < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["adjusted", "adjusted_with_priors"])
 def test_an_adjusted_model_stays_as_good_as_it_was(
     name: str, continued: Path, before: pycolmap.Reconstruction, finished_example: Example
@@ -130,6 +131,7 @@ def test_an_adjusted_model_stays_as_good_as_it_was(
     assert 0 < largest_move(found, before) < 0.02 * finished_example.world.extent
 
 
+@pytest.mark.slow
 def test_a_missing_image_is_registered_and_the_others_stay(
     continued: Path, before: pycolmap.Reconstruction, finished_example: Example
 ) -> None:
@@ -144,6 +146,7 @@ def test_a_missing_image_is_registered_and_the_others_stay(
     assert angle_deg(new, adjusted) < 0.2
 
 
+@pytest.mark.slow
 def test_the_mapper_with_priors_keeps_frame_and_scale(continued: Path, finished_example: Example) -> None:
     found = pycolmap.Reconstruction(continued / "mapped_with_priors/0")
     assert_ids_and_names_agree(found, finished_example)
@@ -151,6 +154,7 @@ def test_the_mapper_with_priors_keeps_frame_and_scale(continued: Path, finished_
     assert largest_move(found, finished_example.model) < 0.02 * finished_example.world.extent
 
 
+@pytest.mark.slow
 def test_global_mapping_has_the_same_shape(continued: Path, finished_example: Example) -> None:
     found = pycolmap.Reconstruction(continued / "mapped_globally/0")
     assert_ids_and_names_agree(found, finished_example)
@@ -158,6 +162,7 @@ def test_global_mapping_has_the_same_shape(continued: Path, finished_example: Ex
     assert distance_after_alignment(found, finished_example.world.centres) < 0.01 * finished_example.world.extent
 
 
+@pytest.mark.slow
 def test_the_dense_workspace_is_fused_and_images_are_undistorted(continued: Path, finished_example: Example) -> None:
     points = pycolmap.Reconstruction()
     points.import_PLY(continued / "fused/fused.ply")

@@ -83,6 +83,7 @@ def test_pins_are_exact_and_name_no_place() -> None:
     assert [line for line in lines if not line.startswith("#") and not pin.fullmatch(line)] == []
 
 
+@pytest.mark.slow
 def test_help_loads_no_heavy_package() -> None:
     program = """
 import contextlib, sys

@@ -111,6 +111,7 @@ def without_numbers(line: str) -> str:
     return re.sub(r"[\d.,]+", "#", line.removesuffix("..."))
 
 
+@pytest.mark.slow
 def test_cheap_commands_give_what_the_page_says(
     finished: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -144,6 +144,7 @@ def test_swapping_the_sides_gives_the_inverse(kernel: RobustKernel) -> None:
     assert_close(align_room(swapped, kernel).inverse(), align_room(data, kernel), 1e-4)
 
 
+@pytest.mark.slow
 def test_scale_does_not_shrink_with_the_noise() -> None:
     # A least-squares (Umeyama) scale is 0.09 % too small here, at every edge of a chain.
     logs = [

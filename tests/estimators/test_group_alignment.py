@@ -103,6 +103,7 @@ def test_warp_is_found_where_a_similarity_leaves_it(group: BendingGroup, kernel:
     assert fit.relative_residual < 0.6 * similar.relative_residual
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", REDESCENDING)
 @pytest.mark.parametrize("group", BENDING)
 def test_warp_survives_30_percent_one_sided_outliers(group: BendingGroup, kernel: RobustKernel) -> None:
@@ -160,6 +161,7 @@ def test_swapping_the_sides_gives_the_inverse(group: BendingGroup) -> None:
     assert 100 * np.linalg.norm(apart, axis=1).max() < {"affine3": 0.01, "sl4": 0.05}[group]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", BENDING)
 def test_volume_does_not_shrink_with_the_noise(group: BendingGroup) -> None:
     # Thickness 1 and isotropic noise of 0.1 on both sides: least squares shrinks that side by 1 %.
@@ -206,6 +208,7 @@ def test_weight_of_two_is_two_rows(group: BendingGroup) -> None:
     assert np.abs(apart).max() < 1e-5
 
 
+@pytest.mark.slow
 def test_sl4_takes_no_more_memory_for_more_points() -> None:
     peaks = []
     for count in (20_000, 400_000):
@@ -350,6 +353,7 @@ def test_thickness_is_measured_against_the_noise(group: BendingGroup, thickness:
     assert bool(fit.fallback) == falls_back
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", BENDING)
 def test_absurd_stretch_falls_back_to_sim3(group: BendingGroup) -> None:
     stretch = Affine3(linear=np.diag([1.0, 1.0, 2.4]), translation=np.zeros(3))
@@ -440,6 +444,7 @@ def test_planes_lines_and_repeated_points_are_refused_by_the_estimators(group: B
         estimate(group, np.ones((300, 3)), plane, np.ones(300))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", get_args(TransformGroup))
 def test_contradictory_pairs_give_one_of_the_two_or_a_bad_residual(group: TransformGroup) -> None:
     data = room_overlap(WARPS[group], seed=1)

@@ -104,6 +104,7 @@ def test_a_pool_goes_on_with_a_new_child_after_one_died() -> None:
         assert living != dead
 
 
+@pytest.mark.slow
 def test_an_error_inside_the_block_ends_the_children_at_once() -> None:
     started = time.monotonic()
     with pytest.raises(KeyboardInterrupt), TaskPool(workers=2) as pool:
@@ -113,12 +114,14 @@ def test_an_error_inside_the_block_ends_the_children_at_once() -> None:
     assert time.monotonic() - started < 30
 
 
+@pytest.mark.slow
 def test_native_messages_go_to_the_log(tmp_path: Path) -> None:
     log = tmp_path / "native.log"
     in_child(write_to_stderr_natively, "from the depths", log_file=log)
     assert "from the depths" in log.read_text()
 
 
+@pytest.mark.slow
 def test_stopping_early_ends_the_children() -> None:
     started = time.monotonic()
     with TaskPool(workers=2) as pool:

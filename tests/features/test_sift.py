@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+import pytest
 from helpers.scenes import CAMERA
 from PIL import Image
 
@@ -17,6 +18,7 @@ from smust3r_colmap.features.sift import extract_features
 from smust3r_colmap.products import ImageCollection, SourceImage
 
 
+@pytest.mark.slow
 def test_an_image_interrupted_between_its_two_writes_is_finished_later(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (30, 40), np.uint8)
     Image.fromarray(noise).resize((640, 480)).save(tmp_path / "0.png")

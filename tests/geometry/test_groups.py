@@ -158,6 +158,7 @@ def test_exp_is_the_matrix_exponential_of_scipy(group: Group, size: float) -> No
     assert matrix_error(group.exp(delta).matrix, expected) < 2e-12
 
 
+@pytest.mark.slow
 @every_group
 def test_log_is_the_matrix_logarithm_of_scipy(group: Group) -> None:
     some = group.exp(tangents(group, (12,), size=0.8))
@@ -617,6 +618,7 @@ def test_a_stretch_is_told_apart_from_rotation_and_scale() -> None:
 
 
 # -------------------------------------------------------------------- matrix functions
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-9, 0.1, 0.5, 1.0])
 def test_matrix_functions_agree_with_scipy(size: float) -> None:
     algebra = size * np.random.default_rng(4).normal(size=(12, 4, 4))

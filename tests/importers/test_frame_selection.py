@@ -37,6 +37,7 @@ def numbers(chosen: Iterable[ChosenFrame], *, rate: float = 10) -> list[int]:
 
 
 # ------------------------------------------------------------------------------- by motion
+@pytest.mark.slow
 @pytest.mark.parametrize("step_px", [0.4, 1.0, 2.5])
 def test_frames_follow_the_motion_and_not_the_speed(step_px: float) -> None:
     places = np.arange(0, 120 * step_px, step_px)

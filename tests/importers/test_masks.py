@@ -397,6 +397,7 @@ def test_a_masked_run_finds_the_cameras_and_names_images_without_a_mask(
     assert 'masks = "' in (output / "config.toml").read_text()
 
 
+@pytest.mark.slow
 def test_a_masked_run_has_neither_features_nor_depth_there(masked_run: tuple[Path, str]) -> None:
     output, _ = masked_run
     model = pycolmap.Reconstruction(output / "sparse/0")
@@ -413,6 +414,7 @@ def test_a_masked_run_has_neither_features_nor_depth_there(masked_run: tuple[Pat
         assert (depth[~is_hidden] > 0).mean() > 0.5
 
 
+@pytest.mark.slow
 def test_the_trainer_gets_the_masks_of_the_run_and_so_does_a_later_export(
     masked_run: tuple[Path, str], tmp_path: Path
 ) -> None:
@@ -433,6 +435,7 @@ def trainer_of(run: Path, output: Path, *, masks: Path | None = None) -> None:
     run_export(Export(run=run, format=("trainer",), output=output, masks=masks, quiet=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
@@ -461,6 +464,7 @@ def test_masks_that_are_not_those_of_the_run_are_refused_unless_they_are_named(
             (masks / name).write_bytes(before[name])
 
 
+@pytest.mark.slow
 def test_a_folder_of_masks_that_is_gone_is_named_with_the_way_out(masked_run: tuple[Path, str], tmp_path: Path) -> None:
     output, _ = masked_run
     masks = output.parent / "masks"
@@ -472,6 +476,7 @@ def test_a_folder_of_masks_that_is_gone_is_named_with_the_way_out(masked_run: tu
         (output.parent / "moved").rename(masks)
 
 
+@pytest.mark.slow
 def test_a_finished_run_that_does_not_know_its_masks_is_damaged(masked_run: tuple[Path, str], tmp_path: Path) -> None:
     output, _ = masked_run
     finished = output / "work" / "finished.json"

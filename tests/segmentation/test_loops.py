@@ -244,6 +244,7 @@ def places_of(kind: str) -> npt.NDArray[np.float64]:
     return np.abs(np.cumsum(rng.normal(0, 1.5, 400)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["rounds", "back and forth", "wandering"])
 @pytest.mark.parametrize(
     ("length", "overlap", "similarity"), [(60, 30, 0.0), (20, 10, 0.0), (20, 10, 0.1), (12, 8, 0.1)]
@@ -273,6 +274,7 @@ def test_laws_of_plans(kind: str, length: int, overlap: int, similarity: float) 
     assert all(one.reason.startswith("taken") == one.taken for one in found.candidates)
 
 
+@pytest.mark.slow
 def test_what_is_not_looked_at_is_counted() -> None:
     found = plan(see(straight(1200) % 70, noise=0.5), length=12, overlap=1, similarity=0.1)
     assert len(found.candidates) == 20 * len(plan_windows(ViewGraph.chain(1200), segment_length=12, overlap=1))

@@ -160,6 +160,7 @@ def test_a_loop_that_is_no_pair_of_the_graph_is_refused() -> None:
 
 
 # ------------------------------------------------------------------------------- size
+@pytest.mark.slow
 def test_100000_images_with_2000000_pairs_fit_in_flat_memory() -> None:
     rng = np.random.default_rng(2)
     pairs = rng.integers(0, 100_000, size=(2_000_000, 2))

@@ -385,6 +385,7 @@ def test_first_node_is_held_exactly() -> None:
     assert np.abs(found.world_from_node.matrix[0] - world_from_other.matrix).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_world_gauge_moves_the_result_along() -> None:
     _, graph, start, _ = measured_ring(61, 8, 2)
     found = optimise(graph, start)
@@ -395,6 +396,7 @@ def test_world_gauge_moves_the_result_along() -> None:
     assert moved.rejected_loops.tolist() == found.rejected_loops.tolist()
 
 
+@pytest.mark.slow
 def test_unit_of_length_does_not_matter() -> None:
     _, graph, start, _ = measured_ring(61, 8, 2)
     found = optimise(graph, start)
@@ -411,6 +413,7 @@ def test_unit_of_length_does_not_matter() -> None:
     assert large.cost_after == pytest.approx(found.cost_after, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_numbering_of_nodes_does_not_matter() -> None:
     _, graph, start, wrong = measured_ring(81, 10, 2)
     found = optimise(graph, start)
@@ -438,6 +441,7 @@ def test_parallel_edges_are_weighted_by_their_information() -> None:
     assert found.cost_after == pytest.approx(4 * 0.002**2 + 0.008**2, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_all_edges_of_a_loop_share_one_weight() -> None:
     """A loop segment between nodes 10 and 50, two kinds of edges to each side; one side is false in both kinds."""
     world, graph, start, _ = measured_ring(61, 8)
@@ -500,6 +504,7 @@ def test_a_loop_that_alone_joins_two_parts_is_accepted() -> None:
     assert len(found.rejected_loops) == 0 and found.cost_after < 1e-6
 
 
+@pytest.mark.slow
 def test_components_are_solved_as_if_alone() -> None:
     _, first, start_first, wrong = measured_ring(61, 10, 2, seed=1)
     _, second, start_second, _ = measured_ring(41, 4, seed=2)

@@ -75,6 +75,7 @@ def test_starting_over_forgets_everything_but_what_somebody_else_put_there(tmp_p
     assert left == ["sparse/0/notes.txt", "work/lock"]
 
 
+@pytest.mark.slow
 def test_a_second_process_is_refused_while_the_first_lives(tmp_path: Path) -> None:
     root = tmp_path / "out"
     code = f"""

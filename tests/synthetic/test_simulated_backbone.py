@@ -173,6 +173,7 @@ def local_change(maps: SimulatedMaps) -> FloatArray:
     return change
 
 
+@pytest.mark.slow
 def test_drift_after_sixty_images_has_the_stated_size(truth: TrueScene) -> None:
     found = errors_over_seeds(
         truth, replace(PERFECT, drift_rotation_deg=2.0), lambda m: angle_deg(local_change(m)[:3, :3])
@@ -188,6 +189,7 @@ def test_drift_after_sixty_images_has_the_stated_size(truth: TrueScene) -> None:
     assert 0.8 * 0.02 * truth.typical_depth < found < 1.2 * 0.02 * truth.typical_depth
 
 
+@pytest.mark.slow
 def test_drift_of_the_scale_is_in_depths_and_in_steps(truth: TrueScene) -> None:
     maps = one_submodel(truth, replace(PERFECT, drift_scale=0.3))
     scales = np.array([np.median(relative_depth(maps, truth, k)) for k in range(61)])
@@ -326,6 +328,7 @@ def pointmap_in(frame_from_cam: FloatArray, pointmap: npt.NDArray[np.float32]) -
 
 
 # ---------------------------------------------------------------------- same again, and lazy
+@pytest.mark.slow
 def test_a_segment_comes_out_the_same_whatever_else_is_asked(truth: TrueScene) -> None:
     settings = replace(SimulationSettings(), warp=0.02)
     alone = one_submodel(truth, settings)
