@@ -24,6 +24,7 @@ from smust3r_colmap.exporters.finished_run import FinishedRun, write_finished
 from smust3r_colmap.exporters.glb import write_glb
 from smust3r_colmap.exporters.mesh import MeshMethod, write_mesh
 from smust3r_colmap.exporters.ply import write_ply
+from smust3r_colmap.exporters.poses_uncertainty import write_uncertainty
 from smust3r_colmap.exporters.training_dataset import write_training_dataset
 from smust3r_colmap.exporters.tum_trajectory import times_of, write_tum
 from smust3r_colmap.importers.masks import masks_of
@@ -33,6 +34,7 @@ from smust3r_colmap.storage.atomic_write import atomic_file, atomic_folder, writ
 from smust3r_colmap.storage.config_file import config_to_toml
 
 TRAINER_FOLDER, DENSE_FOLDER, DATABASE_FILE = "trainer", "dense", "database.db"
+UNCERTAINTY_FILE = "poses_uncertainty.csv"
 _NAMES_SHOWN = 3
 
 
@@ -125,6 +127,9 @@ def export(
             FORMATS[name].write(finished, settings)
         for name, scene in {"trajectory_stitched_tum.txt": initial.scenes[0], **before}.items():
             write_tum(scene, run.folder.root / name, times_of(scene, finished.timestamps_s))
+        if refinement is not None:
+            named = {f"sparse/{number}": one for number, one in enumerate(refinement.uncertainties)}
+            write_uncertainty(named, run.folder.root / UNCERTAINTY_FILE)
         write_atomically(run.folder.root / "config.toml", config_to_toml(config).encode())
         write_finished(run.folder, finished)
         progress.advance()

@@ -39,16 +39,19 @@ from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.images import load_grey, load_rgb
 from smust3r_colmap.products import DepthMaps, ImageCollection, Scene
 from smust3r_colmap.refinement.acceptance import MAX_ERROR_PX
-from smust3r_colmap.refinement.bundle_adjustment import Priors, Tolerance, pose_priors
+from smust3r_colmap.refinement.bundle_adjustment import Tolerance
+from smust3r_colmap.refinement.contradictions import point_support
 from smust3r_colmap.refinement.mapper import (
     COARSE_TOLERANCE_FRACTION,
     FINE_TOLERANCE_FRACTION,
     MapperSession,
     agrees,
+    views_of,
 )
+from smust3r_colmap.refinement.model_uncertainty import ModelUncertainty, adjusted_priors, measure_uncertainty
 from smust3r_colmap.refinement.principal_point import estimate_principal_points
 from smust3r_colmap.refinement.registration import register_images
-from smust3r_colmap.refinement.reregistration import any_misregistered, reregister_images
+from smust3r_colmap.refinement.reregistration import any_misregistered, pair_support, reregister_images
 from smust3r_colmap.refinement.statistics import SceneRefinement, Statistics, StepReport, weak_images
 from smust3r_colmap.storage.codec import Codec
 from smust3r_colmap.storage.run_directory import DATABASE_FILE, MODEL_FOLDER, StageFolder
@@ -56,7 +59,8 @@ from smust3r_colmap.storage.run_directory import DATABASE_FILE, MODEL_FOLDER, St
 logger = logging.getLogger(__name__)
 
 RESULTS: Codec[tuple[SceneRefinement, ...]] = Codec(tuple[SceneRefinement, ...], "refinements")
-"""How the results lie in the folder of the stage."""
+UNCERTAINTIES: Codec[tuple[ModelUncertainty, ...]] = Codec(tuple[ModelUncertainty, ...], "uncertainties")
+"""How the results lie in the folder of the stage, one of each per scene."""
 
 COARSE_ANGLE_DEG, FINE_ANGLE_DEG = 4.0, 2.0
 MIN_FINE_TOLERANCE_PX = 2.6
@@ -77,7 +81,8 @@ class RefineTask:
     """All scenes of a run, to be refined one after the other.
 
     Args:
-        stored: the stage that gets ``0/model``, ``1/model`` ..., ``database.db`` and ``refinements.json``.
+        stored: the stage that gets ``0/model``, ``1/model`` ..., ``database.db``, ``refinements.json`` and
+            ``uncertainties.json``.
         collection: all images.
         scenes: with initial poses; their points are not used.
         features: the run's database of SIFT features and matches, or None.
@@ -89,6 +94,7 @@ class RefineTask:
         tolerance: epipolar and reprojection tolerance at the initial poses, as a fraction of the longer image side.
         principal_point: refine the principal points where the model determines them.
         register_missing: let COLMAP's mapper register images without a pose in the end, in the largest model.
+        initial_poses_count: see ``measure_uncertainty``.
     """
 
     stored: StageFolder
@@ -103,6 +109,7 @@ class RefineTask:
     tolerance: float = COARSE_TOLERANCE_FRACTION
     principal_point: bool = True
     register_missing: bool = False
+    initial_poses_count: bool = False
 
 
 def refine_scenes(task: RefineTask) -> tuple[SceneRefinement, ...]:
@@ -120,9 +127,11 @@ def refine_scenes(task: RefineTask) -> tuple[SceneRefinement, ...]:
             model_folder = folder / str(number) / MODEL_FOLDER
             model_folder.mkdir(parents=True)
             write_binary_checked(outcome.model, model_folder)
-        _write_database(task, features, outcomes, folder / DATABASE_FILE)
+        uncertainties = tuple(_uncertainty(task, features, outcome) for outcome in outcomes)
+        _write_database(task, features, outcomes, uncertainties[0], folder / DATABASE_FILE)
         results = tuple(outcome.result for outcome in outcomes)
         RESULTS.write(folder, results)
+        UNCERTAINTIES.write(folder, uncertainties)
     return results
 
 
@@ -130,7 +139,6 @@ def refine_scenes(task: RefineTask) -> tuple[SceneRefinement, ...]:
 class _Outcome:
     model: pycolmap.Reconstruction
     verified: VerifiedMatches
-    priors: Priors
     result: SceneRefinement
 
 
@@ -282,7 +290,7 @@ def _outcome(
         warnings=warnings,
         steps=tuple(session.steps),
     )
-    return _Outcome(model=model, verified=session.verified, priors=session.priors, result=result)
+    return _Outcome(model=model, verified=session.verified, result=result)
 
 
 def _names(task: RefineTask, image_ids: Sequence[int]) -> tuple[str, ...]:
@@ -332,6 +340,15 @@ def _with_missing_registered(
     return replace(largest, model=model, result=result)
 
 
+def _uncertainty(task: RefineTask, features: MatchedFeatures, outcome: _Outcome) -> ModelUncertainty:
+    model = outcome.model
+    views = views_of(poses_of(model), cameras_of(model, task.collection.cameras), task.collection)
+    supports = (pair_support(features, views), point_support(model, features))
+    return measure_uncertainty(
+        model, supports, calibrated=task.calibrated, initial_poses_count=task.initial_poses_count
+    )
+
+
 def _extract_colors(model: pycolmap.Reconstruction, collection: ImageCollection) -> None:
     """Give each point the mean colour of its observations.
 
@@ -377,8 +394,16 @@ def _without(elsewhere: Collection[int], features: MatchedFeatures) -> MatchedFe
     return replace(features, raw=kept(features.raw), verified=kept(features.verified))
 
 
-def _write_database(task: RefineTask, features: MatchedFeatures, outcomes: Sequence[_Outcome], path: Path) -> None:
-    """All images. Matches within a scene are those that agree with it, all others those of two-view verification."""
+def _write_database(
+    task: RefineTask,
+    features: MatchedFeatures,
+    outcomes: Sequence[_Outcome],
+    uncertainty: ModelUncertainty,
+    path: Path,
+) -> None:
+    """All images; the priors are the positions of the largest model with the covariance of each.
+
+    Matches within a scene are those that agree with it, all others those of two-view verification."""
     scene_of = {i: number for number, outcome in enumerate(outcomes) for i in poses_of(outcome.model)}
     matches = {
         pair: rows
@@ -404,5 +429,5 @@ def _write_database(task: RefineTask, features: MatchedFeatures, outcomes: Seque
         keypoints=features.keypoints,
         matches=dict(sorted(matches.items())),
         j_from_i=j_from_i,
-        priors=pose_priors(largest.model, largest.priors),
+        priors=adjusted_priors(largest.model, uncertainty),
     )

@@ -28,6 +28,7 @@ from smust3r_colmap.features.guided_verification import (
     MIN_MATCHES,
     MIN_VERIFIED,
     MatchedFeatures,
+    View,
     inlier_fractions,
 )
 from smust3r_colmap.geometry.arrays import FloatArray, Pair
@@ -96,11 +97,14 @@ def any_misregistered(session: MapperSession) -> bool:
 
 
 def _support(session: MapperSession, poses: Mapping[int, FloatArray]) -> dict[Pair, EpipolarSupport]:
-    fractions = inlier_fractions(
-        session.features, session.views(poses), tolerance=FINE_TOLERANCE_FRACTION, min_matches=MIN_MATCHES
-    )
+    return pair_support(session.features, session.views(poses))
+
+
+def pair_support(features: MatchedFeatures, views: Mapping[int, View]) -> dict[Pair, EpipolarSupport]:
+    """How the verified matches of all pairs fit the cameras, by image index; few matches say nothing."""
+    fractions = inlier_fractions(features, views, tolerance=FINE_TOLERANCE_FRACTION, min_matches=MIN_MATCHES)
     return {
-        pair: EpipolarSupport(num_matches=len(session.features.verified[pair]), inlier_fraction=fraction)
+        pair: EpipolarSupport(num_matches=len(features.verified[pair]), inlier_fraction=fraction)
         for pair, fraction in fractions.items()
     }
 

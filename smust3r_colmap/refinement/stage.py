@@ -30,8 +30,9 @@ from smust3r_colmap.features.seen_surfaces import seen_surfaces, surfaces_of_clo
 from smust3r_colmap.features.stage import features_of_run, match_pairs_of_run
 from smust3r_colmap.geometry.arrays import FloatArray, Pair
 from smust3r_colmap.products import EMPTY_CLOUD, DepthMaps, ImageCollection, RunFeatures, Scene
-from smust3r_colmap.refinement.global_refinement import RESULTS, RefineTask, refine_scenes
+from smust3r_colmap.refinement.global_refinement import RESULTS, UNCERTAINTIES, RefineTask, refine_scenes
 from smust3r_colmap.refinement.mapper import COARSE_TOLERANCE_FRACTION
+from smust3r_colmap.refinement.model_uncertainty import ModelUncertainty, UncertaintySummary, summarise_uncertainty
 from smust3r_colmap.refinement.statistics import SceneRefinement
 from smust3r_colmap.segmentation.stage import Segments
 from smust3r_colmap.segmentation.view_graph import ViewGraph
@@ -47,7 +48,7 @@ from smust3r_colmap.storage.run_directory import (
 
 NEXT_IMAGES = 4
 """Neighbours in order that are always matched if the backbone has matched nothing."""
-METHOD_VERSION = 6
+METHOD_VERSION = 7
 """To be raised when the refinement changes, so that finished folders are refined again."""
 WORKERS_PER_THREAD = 2
 """Adjustment gains little from threads: on two cores a second one took 70 % more processor time and saved no time."""
@@ -65,12 +66,14 @@ class Refinement:
         key: hash of all that they depend on.
         scenes: with adjusted poses and cameras, without points; the initial one if its refinement failed.
         results: one per scene.
+        uncertainties: of the models, one per scene; none if nothing could be refined.
     """
 
     folder: Path
     key: str
     scenes: tuple[Scene, ...]
     results: tuple[SceneRefinement, ...]
+    uncertainties: tuple[ModelUncertainty, ...] = ()
 
     @property
     def database(self) -> Path:
@@ -81,6 +84,16 @@ class Refinement:
     def models(self) -> tuple[Path | None, ...]:
         """Per scene the folder of its COLMAP model with tracks, or None if its refinement failed."""
         return tuple(self._model(number) if one.succeeded else None for number, one in enumerate(self.results))
+
+    @property
+    def summarised_uncertainties(self) -> tuple[UncertaintySummary | None, ...]:
+        """One per scene; None if its refinement failed."""
+        if not self.uncertainties:
+            return (None,) * len(self.scenes)
+        return tuple(
+            summarise_uncertainty(one) if result.succeeded else None
+            for one, result in zip(self.uncertainties, self.results, strict=True)
+        )
 
     def _model(self, number: int) -> Path:
         return self.folder / str(number) / MODEL_FOLDER
@@ -177,6 +190,7 @@ def refine(
     if not options.refine:
         return None
     source = options.track_source
+    is_network = features is None
     if initial.maps is None and source != "features":
         raise ConfigError(f"--track-source {source}: the model has no depth maps; take features")
     seen = initial.seen()
@@ -187,7 +201,7 @@ def refine(
         features = features or features_of_run(run, collection, feature_options)
         pairs = _match(run, initial, seen, features, options.track_neighbours)
     map_pairs = () if source == "features" else _pairs_for_maps(initial, seen, options.track_neighbours)
-    settings = (options, collection.calibrated, initial.tolerance)
+    settings = (options, collection.calibrated, initial.tolerance, is_network)
     inputs = (METHOD_VERSION, features and features.key, pairs, initial.geometry, settings, initial.maps_key)
     stored = run.folder.stage(REFINED_STAGE, key=key_of(REFINED_STAGE, inputs))
     with run.clock.stage("refinement", total=1) as stage:
@@ -207,6 +221,7 @@ def refine(
                 threads=max(1, run.executor.workers // WORKERS_PER_THREAD),
                 tolerance=initial.tolerance,
                 register_missing=options.register_missing,
+                initial_poses_count=is_network,
             )
             outcome = in_child(refine_scenes, task, log_file=run.folder.native_log)
             stage.advance()
@@ -214,7 +229,13 @@ def refine(
                 run.clock.warn(f"no tracks, the initial poses are kept: {outcome.reason}")
                 failed = tuple(SceneRefinement.failed(scene.image_names, outcome.reason) for scene in initial.scenes)
                 return Refinement(folder=stored.path, key=stored.key, scenes=initial.scenes, results=failed)
-    refined = Refinement(folder=stored.path, key=stored.key, scenes=initial.scenes, results=RESULTS.read(stored.path))
+    refined = Refinement(
+        folder=stored.path,
+        key=stored.key,
+        scenes=initial.scenes,
+        results=RESULTS.read(stored.path),
+        uncertainties=UNCERTAINTIES.read(stored.path),
+    )
     adjusted = tuple(
         scene if model is None else _adjusted_scene(scene, model, collection)
         for scene, model in zip(initial.scenes, refined.models, strict=True)

@@ -56,7 +56,7 @@ def reconstruction(
         output=run.folder.root,
         num_images=len(collection),
         num_registered=len(placed),
-        models=_models(run, fused, [summarise_cameras(one.cameras) for one in stitched.placed]),
+        models=_models(run, fused, [summarise_cameras(one.cameras) for one in stitched.placed], refinement),
         rejected=_rejected(collection),
         unregistered=tuple(
             ImageNote(
@@ -96,7 +96,7 @@ def refined_model(
         output=run.folder.root,
         num_images=len(fitted.collection),
         num_registered=len(placed),
-        models=_models(run, [fused], [None]),
+        models=_models(run, [fused], [None], refinement),
         rejected=_rejected(fitted.collection),
         unregistered=_unplaced(fitted.collection, placed, features, is_refined=is_refined),
         stages=tuple(run.clock.stages),
@@ -123,8 +123,12 @@ def _registered(fused: Sequence[FusedScene]) -> set[int]:
 
 
 def _models(
-    run: Run, fused: Sequence[FusedScene], cameras: Sequence[CameraFusionSummary | None]
+    run: Run,
+    fused: Sequence[FusedScene],
+    cameras: Sequence[CameraFusionSummary | None],
+    refinement: Refinement | None,
 ) -> tuple[ModelSummary, ...]:
+    uncertainties = (None,) * len(fused) if refinement is None else refinement.summarised_uncertainties
     return tuple(
         ModelSummary(
             folder=run.folder.sparse_model(number).relative_to(run.folder.root).as_posix(),
@@ -134,8 +138,9 @@ def _models(
             segments=one.scene.segments,
             cameras=fusion,
             cloud=one.statistics,
+            uncertainty=uncertainty,
         )
-        for number, (one, fusion) in enumerate(zip(fused, cameras, strict=True))
+        for number, (one, fusion, uncertainty) in enumerate(zip(fused, cameras, uncertainties, strict=True))
     )
 
 

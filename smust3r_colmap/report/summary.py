@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 from smust3r_colmap.execution.progress import format_seconds
 from smust3r_colmap.execution.stage_clock import StageSummary
+from smust3r_colmap.report.verdict import Verdict, judge, reasons_of
 
 if TYPE_CHECKING:  # the command line imports this module, and shall not load numpy for --help
     from smust3r_colmap.alignment.stage import EdgeSummary
     from smust3r_colmap.backbones.stage import SegmentSummary
     from smust3r_colmap.exporters.registry import MissingOutput
     from smust3r_colmap.products import CloudStatistics
+    from smust3r_colmap.refinement.model_uncertainty import UncertaintySummary
     from smust3r_colmap.refinement.statistics import SceneRefinement
     from smust3r_colmap.stitching.stage import CameraFusionSummary, GraphSummary, LoopSummary
 
@@ -44,6 +46,7 @@ class ModelSummary:
         segments: names of the submodels that were stitched.
         cameras: how well the submodels agree on the cameras; None where nothing was stitched.
         cloud: how the dense cloud came about; None where nothing was fused.
+        uncertainty: of the adjusted poses; None where nothing was adjusted.
     """
 
     folder: str
@@ -53,6 +56,7 @@ class ModelSummary:
     segments: tuple[str, ...]
     cameras: CameraFusionSummary | None
     cloud: CloudStatistics | None
+    uncertainty: UncertaintySummary | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,38 +131,12 @@ class RunSummary:
     @property
     def weak_reasons(self) -> tuple[str, ...]:
         """Why the result falls short; empty when it does not."""
-        reasons = []
-        if self.rejected:
-            files = self.num_images + len(self.rejected)
-            reasons.append(f"{len(self.rejected)} of {files} files could not be used")
-        if self.unregistered:
-            reasons.append(f"{len(self.unregistered)} of {self.num_images} images got no pose")
-        if len(self.models) > 1:
-            reasons.append(
-                f"the images fall into {len(self.models)} models that could not be connected; "
-                f"the largest has {self.models[0].num_images} of {self.num_images} images"
-            )
-        empty = [
-            str(segment.index) for segment in self.segments if segment.kind != "loop" and not segment.num_submodels
-        ]
-        if empty:
-            reasons.append(f"nothing came out of segment {', '.join(empty)}")
-        doubted = [segment for segment in self.segments if segment.warnings]
-        if doubted:
-            reasons.append(
-                f"the geometry of {len(doubted)} of {len(self.segments)} segments should not be trusted, such as "
-                f"segment {doubted[0].index}: {doubted[0].warnings[0]}"
-            )
-        if self.refinements and not self.refinements[0].succeeded:
-            reasons.append(f"the largest model has no tracks: {self.refinements[0].reason}")
-        folders = [model.folder for model in self.models]
-        refined = [(name, one) for name, one in zip(folders, self.refinements, strict=False) if one.succeeded]
-        num_weak = sum(len(one.weak) for _, one in refined)
-        if num_weak:
-            reasons.append(f"{num_weak} images have too few observations; they keep their initial pose")
-        reasons += [f"{folder}: {warning}" for folder, one in refined for warning in one.warnings]
-        reasons += [f"no {one.name}: {one.reason}" for one in self.missing_outputs]
-        return tuple(reasons)
+        return tuple(reason.text for reason in reasons_of(self))
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the result can be believed, and the heaviest reasons why not."""
+        return judge(self)
 
     @property
     def exit_code(self) -> int:
@@ -175,6 +153,7 @@ class RunSummary:
         facts["schema_version"] = SCHEMA_VERSION
         facts["scale"] = self.scale_statement
         facts["weak_reasons"] = list(self.weak_reasons)
+        facts["verdict"] = asdict(self.verdict)
         plain = _without_nan(facts)
         assert isinstance(plain, dict)
         return plain
@@ -189,7 +168,8 @@ class RunSummary:
         lines += _remark_lines("without a pose", self.unregistered)
         lines += _remark_lines("left out", self.rejected)
         lines += [f"  {note}" for note in self.notes]
-        lines += [f"weak: {reason}" for reason in self.weak_reasons]
+        lines += [line for model in self.models for line in _uncertainty_lines(model)]
+        lines += _verdict_lines(self.verdict, len(self.weak_reasons))
         lines.append(self._cost_line())
         lines.append(f"Result in {self.output}")
         return "\n".join(lines)
@@ -223,6 +203,23 @@ def _refinement_lines(folder: str, one: SceneRefinement) -> list[str]:
             more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
             lines.append(f"  {folder}: {what}: {', '.join(names[:_NAMES_SHOWN])}{more}")
     return lines
+
+
+def _uncertainty_lines(model: ModelSummary) -> list[str]:
+    found = model.uncertainty
+    if found is None:
+        return []
+    return [
+        f"  {model.folder}: predicted error {found.predicted_error_percent:.3g} % of the extent (rms), "
+        f"{found.max_position_percent:.3g} % at {found.least_certain}"
+    ]
+
+
+def _verdict_lines(verdict: Verdict, num_reasons: int) -> list[str]:
+    lines = [f"{verdict.level}: {reason.text}; {reason.advice}" for reason in verdict.reasons]
+    if num_reasons > len(lines):
+        lines.append(f"{verdict.level}: {num_reasons - len(lines)} more reasons, see summary.json")
+    return lines or [f"{verdict.level}"]
 
 
 def _loop_lines(loops: tuple[LoopSummary, ...], note: str) -> list[str]:

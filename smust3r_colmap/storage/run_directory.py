@@ -7,6 +7,7 @@
       trainer/             for splat and NeRF trainers
       dense/               COLMAP's workspace of depth and normal maps, fused.ply
       trajectory_tum.txt  trajectory_stitched_tum.txt  trajectory_without_loops_tum.txt
+      poses_uncertainty.csv
       summary.json  config.toml
       work/
         lock               held by the process that writes
@@ -24,7 +25,7 @@
         alignment/         edges between the submodels
         stitched/          cameras as stitching placed them, one depth map per image
         track_pairs/       image pairs that the stitched geometry suggests for tracks
-        refined/           0/model  1/model ...  database.db  refinements.json
+        refined/           0/model  1/model ...  database.db  refinements.json  uncertainties.json
         carried_depth/     one depth map per image that is no keyframe
         scene/             the adjusted cameras and fused clouds, before they are exported
         finished.json      when all stages stand: which of them belong together, and where the images are
@@ -91,6 +92,7 @@ class RunDirectory:
         "trajectory_tum.txt",
         "trajectory_without_loops_tum.txt",
         "trajectory_stitched_tum.txt",
+        "poses_uncertainty.csv",
         "database.db",
         "trainer",
         "dense",

@@ -671,7 +671,7 @@ def test_each_shortcoming_makes_the_result_weak(summary: RunSummary, reason: str
     assert summary.exit_code == 3
     assert len(summary.weak_reasons) == 1
     assert reason in summary.weak_reasons[0]
-    assert f"weak: {summary.weak_reasons[0]}" in summary.render_text()
+    assert f"{summary.verdict.level}: {summary.weak_reasons[0]}; " in summary.render_text()
 
 
 def test_long_lists_are_cut_in_the_text_but_whole_in_the_json() -> None:

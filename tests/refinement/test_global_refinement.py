@@ -363,10 +363,12 @@ def test_database_and_model_name_and_number_everything_alike(walk: Refined) -> N
     }
     assert frames == set(images)
     assert list(cameras[1].params) == list(model.camera(1).params)
-    assert set(priors) == set(images) - {WITHOUT_POSE + 1}
+    assert set(priors) == set(model.reg_image_ids())
     for i, prior in priors.items():
-        np.testing.assert_allclose(prior.position, centres_of(walk.stitched)[i - 1], atol=1e-9)
+        np.testing.assert_allclose(prior.position, model.image(i).projection_center(), atol=1e-9)
         assert prior.corr_data_id == model.image(i).data_id
+        assert np.linalg.eigvalsh(prior.position_covariance).min() > 0
+    assert len({np.trace(prior.position_covariance) for prior in priors.values()}) == len(priors)
 
 
 def test_points_have_the_colour_of_the_images(walk: Refined) -> None:
