@@ -170,7 +170,7 @@ def test_all_results_are_written(finished: RunSummary) -> None:
     names = {path.name for path in finished.output.iterdir()}
     assert names == {
         "sparse", "database.db", "trainer", "dense", "points.ply", "scene.glb", "trajectory_tum.txt",
-        "trajectory_stitched_tum.txt", "summary.json", "config.toml", "work",
+        "trajectory_stitched_tum.txt", "poses_uncertainty.csv", "summary.json", "config.toml", "work",
     }  # fmt: skip
     facts = json.loads((finished.output / "summary.json").read_text())
     assert facts["num_registered"] == NUM_IMAGES
