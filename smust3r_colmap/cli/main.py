@@ -105,6 +105,11 @@ def _run_guarded(command: Command) -> int:
         return fail(str(error), EXIT_FAILED)
     except KeyboardInterrupt:
         return fail("interrupted; the same command goes on where it stopped", EXIT_INTERRUPTED)
+    except OSError as error:  # what the system refuses outside of the run's folder
+        if command.verbose:
+            traceback.print_exc()
+        where = f"{error.filename}: " if error.filename else ""
+        return fail(f"{where}{error.strerror or error}", EXIT_FAILED)
     except Exception as error:  # the outermost border: an unknown error is a message too
         if command.verbose:
             traceback.print_exc()

@@ -9,8 +9,12 @@ The next module to read is ``training_dataset``.
 
 from __future__ import annotations
 
+import os
+import sqlite3
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +30,12 @@ PATIENCE_S = 30.0
 """How long a database that is locked is waited for."""
 PAUSE_S = 0.02
 """Between two attempts to open it."""
+MAX_PATH_BYTES = 500
+"""SQLite takes 512, with what it appends for its journal."""
+_JOURNAL_BYTES = 8 << 20
+"""SQLite writes changes twice: first into a journal, which is moved into the database every 4 MiB."""
+_BYTES_PER_IMAGE = 1024
+"""Of an image without its features."""
 
 
 def write_colmap_database(
@@ -76,26 +86,67 @@ def open_database(path: Path, *, patience_s: float = PATIENCE_S) -> pycolmap.Dat
     """The run's database, which several processes may open at the same moment.
 
     pycolmap writes when it opens and does not wait for a lock: with two processes one opening in sixty
-    fails with "database is locked". So it is tried again.
+    fails with "database is locked". So it is tried again; whatever else is wrong does not pass.
 
     Raises:
-        StorageError: it cannot be opened for ``patience_s``, or is no database.
+        StorageError: it is locked for ``patience_s``, is no database, or the disk refuses it.
     """
     give_up_s = time.monotonic() + patience_s
     while True:
         try:
             return pycolmap.Database.open(path)
         except RuntimeError as error:
+            _refuse_what_does_not_pass(path)
             if time.monotonic() > give_up_s:
                 raise StorageError(
-                    f"{path}: cannot be opened for {patience_s:.0f} s ({error}); is it held by another process, or "
-                    f"damaged? Delete {path.parent} or start with --overwrite"
+                    f"{path}: cannot be opened for {patience_s:.0f} s ({error}); another process holds it, wait for it"
                 ) from error
             time.sleep(PAUSE_S)
 
 
+def _refuse_what_does_not_pass(path: Path) -> None:
+    """Say why a database cannot be opened, which pycolmap does not tell, unless it is only locked."""
+    try:
+        with closing(sqlite3.connect(path, timeout=0)) as connection:
+            connection.execute("SELECT COUNT(*) FROM sqlite_master")
+    except sqlite3.OperationalError as error:
+        if "locked" in str(error):
+            return
+        length = len(os.fsencode(path.resolve()))
+        if length > MAX_PATH_BYTES:
+            reason = f"its path has {length} bytes, and SQLite takes {MAX_PATH_BYTES}; name a shorter output folder"
+            raise StorageError(f"{path}: cannot be opened: {reason}") from error
+        raise StorageError(f"{path}: cannot be opened ({error}); finished stages are kept") from error
+    except sqlite3.DatabaseError as error:
+        raise StorageError(
+            f"{path}: cannot be opened (it is damaged: {error}); delete {path.parent} or start with --overwrite"
+        ) from error
+    check_room(path, 0)
+
+
+def check_room(path: Path, num_bytes: int) -> None:
+    """Refuse to go on where the disk would refuse ``num_bytes`` more of a database: pycolmap ends the process then.
+
+    Raises:
+        StorageError: with the words of the system, which also knows of limits of users and of file sizes.
+    """
+    needed = 2 * num_bytes + _JOURNAL_BYTES
+    size = path.stat().st_size if path.exists() else 0
+    try:
+        with tempfile.TemporaryFile(dir=path.parent) as probe:
+            os.ftruncate(probe.fileno(), size + needed)
+            os.ftruncate(probe.fileno(), 0)
+            os.posix_fallocate(probe.fileno(), 0, needed)
+    except OSError as error:
+        raise StorageError(
+            f"{path}: {error.strerror}, {needed / 2**20:.0f} MiB more are needed; finished stages are kept, and with "
+            "more room the same command goes on"
+        ) from error
+
+
 def create_database(path: Path, collection: ImageCollection) -> None:
     """Write cameras, rigs, frames and images with our ids, unless the database has them already."""
+    check_room(path, len(collection) * _BYTES_PER_IMAGE)
     with open_database(path) as database:
         if database.num_frames() == len(collection):  # an image's frame is written last
             return

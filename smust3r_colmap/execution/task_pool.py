@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import signal
 import threading
 import time
@@ -32,6 +33,8 @@ TaskT = TypeVar("TaskT")
 ResultT = TypeVar("ResultT")
 
 _PARENT_POLL_S = 1.0
+_DISK_REFUSED = re.compile("database or disk is full|disk I/O error|No space left on device|File too large")
+"""What native code writes before it ends the process."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +108,7 @@ class TaskPool:
         self.log_file = log_file
         self._executor: ProcessPoolExecutor | None = None
         self._cpu_s: dict[int, float] = {}
+        self._log_start = 0
 
     def __enter__(self) -> TaskPool:
         _open_pools.append(self)
@@ -132,6 +136,7 @@ class TaskPool:
             for index in suspects:
                 died = yield from self._run_until_broken(function, tasks, deque([index]), 1)
                 if died:
+                    self._refuse_full_disk()
                     reason = "the process that worked on it died (out of memory, or an error inside a native library)"
                     yield TaskResult(index=index, value=TaskFailure(reason=reason, crashed=True))
 
@@ -162,8 +167,27 @@ class TaskPool:
             raise
         return []
 
+    def _refuse_full_disk(self) -> None:
+        """A child that died because the disk refused a write is no failure of its task.
+
+        Raises:
+            StorageError: its native code said so before.
+        """
+        if self.log_file is None or not self.log_file.exists():
+            return
+        with self.log_file.open("rb") as log:
+            log.seek(self._log_start)
+            said = _DISK_REFUSED.search(log.read().decode(errors="replace"))
+        if said:
+            raise StorageError(
+                f"{self.log_file.parent}: {said[0]}; finished stages are kept, and with more room the "
+                "same command goes on"
+            )
+
     def _started(self) -> ProcessPoolExecutor:
         if self._executor is None:
+            has_log = self.log_file is not None and self.log_file.exists()
+            self._log_start = self.log_file.stat().st_size if has_log and self.log_file is not None else 0
             self._executor = ProcessPoolExecutor(
                 max_workers=self.workers,
                 mp_context=get_context("spawn"),

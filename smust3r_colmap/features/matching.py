@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from smust3r_colmap.colmap.database import internal_name, open_database
+from smust3r_colmap.colmap.database import check_room, internal_name, open_database
 from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.execution.task_pool import Executor, TaskFailure, TaskPool
 from smust3r_colmap.features.guided_verification import matches_by_pair
@@ -33,6 +33,8 @@ logger = logging.getLogger(__name__)
 _PAIRS_PER_THREAD = 100
 _PAIRS_VERIFIED_AT_ONCE = 500
 """Their matches are in memory."""
+_BYTES_PER_PAIR = 16 << 10
+"""A thousand matches, before and after verification."""
 _WATERMARK = int(pycolmap.TwoViewGeometryConfiguration.WATERMARK)
 
 
@@ -59,6 +61,9 @@ def match_pairs(
 
     Returns:
         The finished pairs; the others failed and are tried again at the next start.
+
+    Raises:
+        StorageError: the disk is full.
     """
     wanted = sorted(set(pairs))
     with open_database(path) as database:
@@ -71,10 +76,12 @@ def match_pairs(
     ]
     # One child with threads, not many children: SQLite takes one writer at a time.
     with TaskPool(workers=1, log_file=log_file) as child:
-        for result in child.map(_match, tasks):
+        for task in tasks:
+            check_room(path, len(task.pairs) * _BYTES_PER_PAIR)
+            (result,) = child.map(_match, [task])
             if isinstance(result.value, TaskFailure):
-                logger.warning("up to %d pairs not matched: %s", len(tasks[result.index].pairs), result.value.reason)
-            stage.advance(len(tasks[result.index].pairs))
+                logger.warning("up to %d pairs not matched: %s", len(task.pairs), result.value.reason)
+            stage.advance(len(task.pairs))
     with open_database(path) as database:
         return frozenset(pair for pair in wanted if database.exists_matches(pair[0] + 1, pair[1] + 1))
 
@@ -121,6 +128,7 @@ def drop_matches_without_evidence(
                 for pair in pairs_of_one_size[start : start + _PAIRS_VERIFIED_AT_ONCE]
                 if (static := static_matches(matches := reader.matches(pair), regions)).any()
             ]
+            check_room(path, sum(2 * reader.rows[task.pair].nbytes for task in tasks))
             for result in executor.map(_verify, tasks):
                 task, value = tasks[result.index], result.value
                 if isinstance(value, TaskFailure):

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from smust3r_colmap.colmap.database import open_database
+from smust3r_colmap.colmap.database import check_room, open_database
 from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.execution.task_pool import Executor, TaskFailure
 from smust3r_colmap.importers.images import load_grey
@@ -58,6 +58,9 @@ def extract_features(
     Keypoints are in pixels of the original image (first pixel centre at 0.5), whatever
     ``max_image_size`` they were found at, and none lies on a pixel that the image's mask leaves out.
     An image that fails gets none and is tried again at the next start.
+
+    Raises:
+        StorageError: the disk is full.
     """
     failed = []
     with open_database(path) as database:
@@ -73,6 +76,7 @@ def extract_features(
             if isinstance(features, TaskFailure):
                 failed.append(RejectedImage(name=collection.images[index].name, reason=f"SIFT: {features.reason}"))
             else:
+                check_room(path, features.keypoints.nbytes + features.descriptors.nbytes)
                 _write_features(database, index, features)
             stage.advance()
     return tuple(failed)

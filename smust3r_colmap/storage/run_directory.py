@@ -102,8 +102,11 @@ class RunDirectory:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        if root.exists() and not root.is_dir():
-            raise RunDirectoryError(f"{root}: is a file; --output must name a folder")
+        with storage_errors(root):
+            if root.is_symlink() and not root.exists():
+                raise RunDirectoryError(f"{root}: is a link to {root.readlink()}, which is not there; name a folder")
+            if root.exists() and not root.is_dir():
+                raise RunDirectoryError(f"{root}: is a file; --output must name a folder")
         lock = self.work / "lock"
         self._lock = FileLock(lock)
         with storage_errors(root):

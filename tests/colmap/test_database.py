@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import resource
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,9 +15,9 @@ from helpers.finished_runs import CAMERA, NAMES, NUM_PLACED, WITHOUT_FEATURES, E
 from helpers.mapped_segments import NUM_IMAGES, synthetic_segment
 from helpers.tracked_scenes import make_collection, true_matches
 
-from smust3r_colmap.colmap.database import open_database, write_colmap_database
+from smust3r_colmap.colmap.database import check_room, open_database, write_colmap_database
 from smust3r_colmap.errors import StorageError
-from smust3r_colmap.execution.task_pool import TaskPool
+from smust3r_colmap.execution.task_pool import TaskPool, in_child
 
 
 @pytest.fixture(scope="module")
@@ -146,6 +148,55 @@ def test_processes_that_open_the_database_at_the_same_moment_wait_for_each_other
     with TaskPool(workers=2) as pool:
         results = list(pool.map(open_many_times, [path] * 2))
     assert [result.value for result in results] == [NUM_IMAGES, NUM_IMAGES]
+
+
+def test_what_does_not_pass_is_not_waited_for(tmp_path: Path) -> None:
+    """A path that SQLite cannot hold, and a folder that is not there: said at once, without advice to delete."""
+    deep = tmp_path.joinpath(*["d" * 100] * 6)
+    deep.mkdir(parents=True)
+    start = time.monotonic()
+    with pytest.raises(StorageError, match=r"its path has \d+ bytes, and SQLite takes 500; name a shorter") as long:
+        open_database(deep / "database.db", patience_s=30)
+    with pytest.raises(StorageError, match=r"unable to open database file") as gone:
+        open_database(tmp_path / "gone" / "database.db", patience_s=30)
+    assert time.monotonic() - start < 5
+    assert not any(word in str(error.value).lower() for error in (long, gone) for word in ("delete", "overwrite"))
+
+
+def test_a_database_that_is_held_is_waited_for_and_never_advised_to_be_deleted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "database.db"
+    pycolmap.Database.open(path).close()
+    opened = pycolmap.Database.open
+    tries: list[Path] = []
+
+    def held(path: Path) -> pycolmap.Database:
+        tries.append(path)
+        if len(tries) < 4:
+            raise RuntimeError("No registered database factory succeeded.")
+        return opened(path)
+
+    monkeypatch.setattr(pycolmap.Database, "open", held)
+    with pytest.raises(StorageError, match=r"cannot be opened for 0 s .*another process holds it, wait") as gave_up:
+        open_database(path, patience_s=0)
+    assert "delete" not in str(gave_up.value).lower()
+    open_database(path, patience_s=5).close()
+    assert len(tries) == 4
+
+
+def limited(path: Path) -> str:
+    """What ``check_room`` says in a process whose files may have 1 MB; the limit ends with the process."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
+    check_room(path, 100)
+    return "went on"
+
+
+def test_a_disk_that_refuses_is_told_in_the_words_of_the_system(tmp_path: Path) -> None:
+    check_room(tmp_path / "database.db", 100)
+    with pytest.raises(StorageError, match=r"database.db: File too large, 8 MiB more are needed; .* the same command"):
+        in_child(limited, tmp_path / "database.db")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_file_that_is_no_database_is_named(tmp_path: Path) -> None:

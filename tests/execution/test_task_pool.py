@@ -129,3 +129,19 @@ def test_stopping_early_ends_the_children() -> None:
         next(results)
         results.close()  # type: ignore[attr-defined]
     assert time.monotonic() - started < 30
+
+
+def die_of_a_full_disk(text: str) -> None:
+    os.write(2, text.encode())
+    os.abort()
+
+
+@pytest.mark.slow
+def test_a_child_that_died_of_a_full_disk_ends_the_run(tmp_path: Path) -> None:
+    """What an earlier run left in the log is of no importance."""
+    log = tmp_path / "native.log"
+    log.write_text("SQLite error: database or disk is full\n")
+    failed = in_child(die_of_a_full_disk, "some other fatal error\n", log_file=log)
+    assert isinstance(failed, TaskFailure) and failed.crashed
+    with pytest.raises(StorageError, match=r"disk I/O error; finished stages are kept, and with more room the same"):
+        in_child(die_of_a_full_disk, "[database_sqlite.cc:9] SQLite error: disk I/O error\n", log_file=log)

@@ -141,6 +141,17 @@ def test_a_file_as_output_is_refused(tmp_path: Path) -> None:
         RunDirectory(tmp_path / "out")
 
 
+def test_a_dangling_link_as_output_is_named(tmp_path: Path) -> None:
+    (tmp_path / "out").symlink_to(tmp_path / "unplugged")
+    with pytest.raises(RunDirectoryError, match=r"out: is a link to .*unplugged, which is not there"):
+        RunDirectory(tmp_path / "out")
+
+
+def test_a_name_that_the_system_does_not_take_is_told_in_its_words(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match=r"File name too long"):
+        RunDirectory(tmp_path / ("n" * 300))
+
+
 def test_a_full_disk_is_named_and_finished_stages_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with RunDirectory(tmp_path / "out") as run:
         with run.stage("mapping", key="k").write():
