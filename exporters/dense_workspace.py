@@ -206,10 +206,15 @@ def _look_at(images: Path, model: pycolmap.Reconstruction, image_id: int, bits: 
     return _Source(
         image_id=image_id,
         name=name,
-        workspace_name=f"{name}.png" if unreadable else name,
+        workspace_name=_name_for_cfg(f"{name}.png" if unreadable else name, image_id),
         as_copy=unreadable or photo.deep or (upright and _is_turned(data)),
         bits=bits.get(name),
     )
+
+
+def _name_for_cfg(name: str, image_id: int) -> str:
+    """Lines of COLMAP's .cfg files lose blanks at their ends, and are comments if they begin with #."""
+    return name if name == name.strip() and not name.startswith("#") else f"image{image_id}_{name.strip(' #')}"
 
 
 _KNOWN_TO_COLMAP = (b"\xff\xd8\xff", b"\x89PNG", b"II*\0", b"MM\0*", b"BM")
@@ -252,7 +257,7 @@ def _undistort(
     inputs = partial / "inputs"
     (inputs / "model").mkdir(parents=True)
     original.write_binary(inputs / "model")
-    if any(source.as_copy for source in sources):
+    if any(source.as_copy or source.workspace_name != source.name for source in sources):
         _lay_out(original, images, sources, inputs)
         images = inputs / "images"
     task = _UndistortionTask(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -35,7 +36,10 @@ def reporting(*, quiet: bool, verbose: bool) -> Iterator[Reporter]:
     package_logger.setLevel(logging.DEBUG if verbose else logging.WARNING)
     package_logger.propagate = False
     try:
-        yield reporter
+        with warnings.catch_warnings():
+            # Pillow warns three times of every broken EXIF, with paths of its own; the import names such files.
+            warnings.filterwarnings("ignore", module=r"PIL\.")
+            yield reporter
     finally:
         package_logger.removeHandler(handler)
         package_logger.setLevel(level_before)

@@ -31,6 +31,8 @@ from smust3r_colmap.storage.run_directory import key_of
 _STATIC_REGIONS: Codec[StaticRegions] = Codec(StaticRegions, "static_regions")
 """Beside the database of the features."""
 _PAIRS: Codec[tuple[Pair, ...]] = Codec(tuple[Pair, ...], "pairs")
+_BYTES_PER_FEATURE = 72
+"""Half of a descriptor and a keypoint: images have fewer features than are allowed."""
 _DESCRIPTORS: Codec[Float32Array] = Codec(Float32Array, "descriptors")
 
 
@@ -41,6 +43,8 @@ def features_of_run(run: Run, collection: ImageCollection, options: FeatureConfi
     masks = (collection.mask_digests,) if collection.mask_digests else ()
     stored = run.folder.stage("features", key=key_of("features", images, collection.cameras, *settings, *masks))
     database = stored.open_in_place() / "database.db"
+    there = database.stat().st_size if database.exists() else 0
+    run.folder.check_space("the features", len(collection) * options.max_features * _BYTES_PER_FEATURE - there)
     create_database(database, collection)
     with run.clock.stage("features", total=len(collection)) as stage:
         rejected = extract_features(

@@ -214,7 +214,7 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
     principal_point = _refine_principal_points(session, wanted=task.principal_point)
 
     _adjust_until_converged(session, fine)
-    warnings = _warnings(session, reregistered)
+    warnings = _warnings(session, reregistered, may_zoom=_may_zoom(task))
     session.reset_weak_images()
     session.end()
     _extract_colors(session.model, task.collection)
@@ -254,11 +254,17 @@ def _adjust_until_converged(session: MapperSession, tolerance: Tolerance) -> Non
             return
 
 
-def _warnings(session: MapperSession, reregistered: StepReport | None) -> tuple[str, ...]:
+def _may_zoom(task: RefineTask) -> bool:
+    """Images share a camera of which only the user knows that they do."""
+    return not task.calibrated and len(task.collection.cameras) < len(task.collection)
+
+
+def _warnings(session: MapperSession, reregistered: StepReport | None, *, may_zoom: bool) -> tuple[str, ...]:
     """What speaks against the model: images that are still misregistered, and no accepted adjustment."""
     warnings = []
     if reregistered is not None and any_misregistered(session) and not reregistered.accepted:
-        warnings.append(reregistered.reason)
+        hint = "; with several lenses or zooms, --camera-mode per-image (refine: --no-share-cameras) may help"
+        warnings.append(reregistered.reason + (hint if may_zoom else ""))
     adjustments = [step for step in session.steps if "adjustment" in step.name]
     if not any(step.accepted for step in adjustments):
         warnings.append(f"no bundle adjustment was accepted: {adjustments[-1].reason}")

@@ -141,6 +141,24 @@ class RunDirectory:
         """The stage at ``work/NAMES...`` that is finished only under this key."""
         return StageFolder(path=self.work.joinpath(*names), key=key)
 
+    def check_space(self, what: str, num_bytes: int) -> None:
+        """Refuse to begin what the disk has no room for.
+
+        Args:
+            what: is about to be written, as a plural.
+            num_bytes: an estimate of its size.
+
+        Raises:
+            StorageError: less is free; it names both.
+        """
+        with storage_errors(self.root):
+            free = shutil.disk_usage(self.root).free
+        if free < num_bytes:
+            raise StorageError(
+                f"{self.root}: {what} need about {num_bytes / 2**20:.0f} MiB, and {free / 2**20:.0f} MiB are free; "
+                "finished stages are kept, and with more room the same command goes on"
+            )
+
     def sparse_model(self, index: int) -> Path:
         """Folder of the COLMAP model number ``index``."""
         return self.root / "sparse" / str(index)

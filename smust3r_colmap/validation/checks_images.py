@@ -93,8 +93,8 @@ def _has_shape(file: ImageFile, camera: Camera) -> bool:
     "image-exif-turned",
     "image files that EXIF says to turn by a quarter",
     severity=Severity.NOTE,
-    advice="turn the pixels and remove the tag: COLMAP and most trainers read pixels as stored, OpenCV and browsers "
-    "turn them",
+    advice="remove the tag and leave the pixels: the model is of them as stored, as COLMAP and trainers read them; "
+    "OpenCV and browsers turn them",
 )
 def _turned(subject: Subject) -> Evidence | None:
     return _turned_with(subject, upright=False)

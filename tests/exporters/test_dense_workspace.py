@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -168,6 +169,26 @@ def test_the_fused_cloud_lies_on_the_surfaces(written: Written) -> None:
     cosines = np.einsum("ni,ni->n", normals, truth) / np.linalg.norm(truth, axis=1)
     assert np.median(np.degrees(np.arccos(np.clip(cosines, -1, 1)))) < 2, "COLMAP read the normal maps as we meant them"
     assert (written.folder / "fused.ply.vis").stat().st_size > 8 + (4 + 4 * 3) * len(points)
+
+
+@pytest.mark.slow
+def test_names_that_cfg_files_cannot_hold_are_renamed(tmp_path: Path, pictures: Path) -> None:
+    """A line of a .cfg file loses blanks at its ends, and is a comment if it begins with #."""
+    shutil.copytree(pictures, tmp_path / "pictures")
+    model, maps = exact_model(), exact_maps()
+    new_name = {NAMES[0]: f" lead{Path(NAMES[0]).suffix}", NAMES[1]: f"#01 wall{Path(NAMES[1]).suffix}"}
+    for image in model.images.values():
+        if image.name in new_name:
+            (tmp_path / "pictures" / image.name).rename(tmp_path / "pictures" / new_name[image.name])
+            maps[new_name[image.name]] = maps.pop(image.name)
+            image.name = new_name[image.name]
+    scaled = maps_of({name: depth / np.float32(UNIT) for name, depth in maps.items()})
+    write_dense_workspace(model, tmp_path / "pictures", scaled, tmp_path / "dense")
+    lines = (tmp_path / "dense/stereo/fusion.cfg").read_text().splitlines()
+    assert len(lines) == len(NAMES)
+    assert all(line == line.strip() and not line.startswith("#") for line in lines)
+    assert all((tmp_path / "dense/images" / line).is_file() for line in lines)
+    assert len(trimesh.load(tmp_path / "dense/fused.ply").vertices) > 0
 
 
 def test_the_report_counts_what_is_there(written: Written) -> None:

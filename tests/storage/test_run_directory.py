@@ -152,6 +152,15 @@ def test_a_name_that_the_system_does_not_take_is_told_in_its_words(tmp_path: Pat
         RunDirectory(tmp_path / ("n" * 300))
 
 
+def test_what_the_disk_has_no_room_for_is_not_begun(tmp_path: Path) -> None:
+    with RunDirectory(tmp_path / "out") as run:
+        run.check_space("the features", 1000)
+        with pytest.raises(
+            StorageError, match=r"out: the features need about 1073741824 MiB, and \d+ MiB are free; .*goes"
+        ):
+            run.check_space("the features", 2**50)
+
+
 def test_a_full_disk_is_named_and_finished_stages_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with RunDirectory(tmp_path / "out") as run:
         with run.stage("mapping", key="k").write():
