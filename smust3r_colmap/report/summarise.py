@@ -71,7 +71,7 @@ def reconstruction(
         edges=summarise_edges(edges, result.submodels),
         loops=summarise_loops(segments.loops, stitched.stitching, collection),
         loops_note=segments.loops.note,
-        graph=summarise_graph(stitched.stitching),
+        graph=summarise_graph(stitched),
         peak_memory_bytes=peak_memory_bytes(),
         refinements=() if refinement is None else refinement.results,
         missing_outputs=outputs.missing,

@@ -28,7 +28,7 @@ class ChainedPart:
 
     Args:
         submodels: positions in the list of all submodels; the first is the world frame.
-        world_from_seg: one per submodel, the first the identity; all in one group.
+        world_from_seg: one per submodel, the first the identity, or a scale (``common_unit``); all in one group.
         edges: positions of the alignments in the spanning tree.
     """
 

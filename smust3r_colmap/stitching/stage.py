@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +29,7 @@ from smust3r_colmap.stitching.camera_fusion import (
     fuse_cameras,
     fuse_intrinsics,
 )
+from smust3r_colmap.stitching.common_unit import in_common_unit
 from smust3r_colmap.stitching.resection import PlacedSubmodel, place_submodel
 from smust3r_colmap.stitching.spanning_tree import ChainedPart
 from smust3r_colmap.stitching.stitch import Stitching, stitch_submodels
@@ -63,12 +64,14 @@ class Stitched:
         stitching: frames of the submodels, decisions on loops, pose graph.
         without_loops: the largest scene as the windows alone place it; None where no loop was closed, or where
             the windows alone, in SL(4), send a camera beyond infinity.
+        unit_spread_percent: see ``GraphSummary``.
     """
 
     placed: tuple[PlacedScene, ...]
     maps: StoredDepthMaps
     stitching: Stitching
     without_loops: Scene | None
+    unit_spread_percent: float
 
     @property
     def scenes(self) -> tuple[Scene, ...]:
@@ -125,6 +128,7 @@ class GraphSummary:
         cost_before, cost_after: of the same objective; without loops and with one edge per pair, zero.
         iterations, stop_reason: of the optimiser.
         improved: its result was used; otherwise the chain was kept.
+        unit_spread_percent: robust standard deviation of the units of metric submodels; NaN without such.
     """
 
     num_nodes: int
@@ -135,6 +139,7 @@ class GraphSummary:
     iterations: int
     stop_reason: str
     improved: bool
+    unit_spread_percent: float = math.nan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,13 +182,35 @@ def stitch(
             kernel=loop_closing.loop_kernel,
         )
         progress.advance()
+    stitching, spread_percent = _in_common_units(stitching, result)
     if not stitching.solution.improved and len(edges.alignments):
         run.clock.note(f"pose graph: {stitching.solution.stop_reason}")
     placed, maps = _place(run, result, segments, stitching.parts, collection)
     without_loops = None
     if any(decision.accepted for decision in stitching.decisions):
         without_loops = _without_loops(run, result, segments, stitching.chained, collection)
-    return Stitched(placed=placed, maps=maps, stitching=stitching, without_loops=without_loops)
+    return Stitched(
+        placed=placed,
+        maps=maps,
+        stitching=stitching,
+        without_loops=without_loops,
+        unit_spread_percent=spread_percent,
+    )
+
+
+def _in_common_units(stitching: Stitching, result: BackboneResult) -> tuple[Stitching, float]:
+    """Metric parts in the unit of all their submodels, and the spread of the units in percent; NaN without any."""
+
+    def is_metric(part: ChainedPart) -> bool:
+        return all(result.reconstructions[result.submodels[p].segment].metric for p in part.submodels)
+
+    def scaled(parts: Sequence[ChainedPart]) -> list[tuple[ChainedPart, float]]:
+        return [in_common_unit(part) if is_metric(part) else (part, math.nan) for part in parts]
+
+    parts, chained = scaled(stitching.parts), scaled(stitching.chained)
+    spreads = [spread for _, spread in parts if math.isfinite(spread)]
+    changed = replace(stitching, parts=tuple(part for part, _ in parts), chained=tuple(part for part, _ in chained))
+    return changed, 100 * max(spreads, default=math.nan)
 
 
 def placed_submodels(
@@ -294,9 +321,9 @@ def _without_repeats(placed: Sequence[PlacedScene]) -> tuple[PlacedScene, ...]:
 
 
 # ---------------------------------------------------------------------------- summaries
-def summarise_graph(stitching: Stitching) -> GraphSummary:
+def summarise_graph(stitched: Stitched) -> GraphSummary:
     """What the optimiser did."""
-    solution = stitching.solution
+    stitching, solution = stitched.stitching, stitched.stitching.solution
     return GraphSummary(
         num_nodes=sum(len(part.submodels) for part in stitching.parts),
         num_edges=stitching.num_edges,
@@ -306,6 +333,7 @@ def summarise_graph(stitching: Stitching) -> GraphSummary:
         iterations=solution.iterations,
         stop_reason=solution.stop_reason,
         improved=solution.improved,
+        unit_spread_percent=stitched.unit_spread_percent,
     )
 
 
