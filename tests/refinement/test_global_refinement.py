@@ -724,6 +724,7 @@ def test_child_does_the_work_and_a_second_start_reads_what_it_stored(
     assert second.scenes[0].cameras == scene.cameras
 
 
+@pytest.mark.slow
 def test_other_settings_or_poses_are_another_refinement(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     runs = []
 

@@ -175,6 +175,7 @@ def test_new_poses_that_are_misregistered_too_are_rejected(world: World, tmp_pat
     assert_rejected(session, r"\d are misregistered at the new poses, too", map_images=better)
 
 
+@pytest.mark.slow
 def test_images_keep_their_poses_if_the_mapper_connects_nothing(world: World, tmp_path: Path) -> None:
     session = session_at(world, bent_after(world, LAST_SOUND, 12.0), tmp_path)
 

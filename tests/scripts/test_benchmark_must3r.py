@@ -106,6 +106,7 @@ def test_float32_modes_say_the_same_and_bfloat16_nearly(rows: dict[str, benchmar
     assert 1e-4 < rough.focal_percent < 1 and 1e-4 < rough.rotation_deg < 1 and 1e-5 < rough.centre < 0.05
 
 
+@pytest.mark.slow
 def test_published_mode_asks_for_all_outputs_and_others_do_not(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[bool] = []
     see = Decoder.see

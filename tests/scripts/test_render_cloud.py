@@ -37,6 +37,7 @@ def pixels_of(picture: Path, colour: tuple[int, int, int]) -> list[int]:
     return [int((view == colour).all(axis=2).sum()) for view in views]
 
 
+@pytest.mark.slow
 def test_the_cloud_of_the_run_is_drawn_unless_another_is_named(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -50,6 +51,7 @@ def test_the_cloud_of_the_run_is_drawn_unless_another_is_named(
     assert pixels_of(fused, BLUE) == [above, side, seen]
 
 
+@pytest.mark.slow
 def test_the_overview_shows_cameras_and_what_faces_the_viewer(run: Path, tmp_path: Path) -> None:
     """A floor that is red towards the sky and blue towards the ground, seen from above."""
     model = pycolmap.Reconstruction(run / "sparse/0")

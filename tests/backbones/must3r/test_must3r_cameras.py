@@ -424,6 +424,7 @@ def test_upstream_gives_every_image_its_own_focal_length() -> None:
     assert (first.depth_factor, second.depth_factor) == (1.0, 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera_fit", CAMERA_FITS)
 def test_cameras_do_not_depend_on_unit_or_place_of_the_segment(camera_fit: CameraFit) -> None:
     rng = np.random.default_rng(3)
@@ -519,6 +520,7 @@ BROKEN: dict[Damage, str] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("camera_fit", CAMERA_FITS)
 @pytest.mark.parametrize("alone", [True, False])

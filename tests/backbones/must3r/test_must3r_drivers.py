@@ -322,6 +322,7 @@ CHOICES: dict[str, Callable[[int], KeyframeChoice]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rerender", [True, False])
 @pytest.mark.parametrize("refinements", [0, 2])
 @pytest.mark.parametrize("num_images", [1, 2, 3, 9])
@@ -383,6 +384,7 @@ class LoadedOnDemand(Sequence[EncodedImage]):
         return len(self.stored)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("choice", CHOICES)
 def test_images_are_loaded_a_batch_at_a_time(choice: str) -> None:
     images = LoadedOnDemand(some_images(9))
@@ -419,6 +421,7 @@ def finish_segment(
     return predictions, memories[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("refinements", "rerender", "heads"),
     [(0, True, 9), (2, True, 9), (0, False, 8), (2, False, 8)],  # without: one for the pair, one for each other image
@@ -448,6 +451,7 @@ def test_refinement_leaves_the_reference_alone_and_renews_the_others() -> None:
             assert torch.equal(before, after) == (label == 0)
 
 
+@pytest.mark.slow
 def test_refinement_shows_each_image_to_the_others_and_its_old_self() -> None:
     images = some_images(2)
     memory = finish(remember(small_network(), images, range(2), keyframes=range(2)))[1].memory
@@ -472,6 +476,7 @@ def test_the_first_listed_image_is_the_reference_unless_ordered_by_shape() -> No
     assert list(by_shape[0]) == [0, 1, 2]  # predictions come as listed
 
 
+@pytest.mark.slow
 def test_memory_never_holds_more_than_was_asked_for() -> None:
     sizes: list[int] = []
     rooms: list[int] = []
@@ -490,6 +495,7 @@ def test_memory_never_holds_more_than_was_asked_for() -> None:
     assert max(np.diff([*keyframes, 20])) <= 10  # they stay spread over the segment
 
 
+@pytest.mark.slow
 def test_a_keyframe_of_another_shape_can_take_the_place() -> None:
     portrait = encode(small_network(), [torch.zeros(3, 64, 32)])[0]
     images = [*some_images(4), portrait]
@@ -503,6 +509,7 @@ def first_tokens(images: Sequence[EncodedImage]) -> tuple[Tensor, ...]:
         return small_network().decoder.see(images[:2], None).remembered[0]
 
 
+@pytest.mark.slow
 def test_local_context_keeps_the_last_images_for_a_while() -> None:
     labels: list[list[int]] = []
     run = remember(
@@ -532,6 +539,7 @@ class FailsAt(LoadedOnDemand):
         return super().__getitem__(index)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("choice", CHOICES)
 def test_nothing_is_held_once_memory_has_run_out(choice: str) -> None:
     tokens: list[weakref.ref[Any]] = []
