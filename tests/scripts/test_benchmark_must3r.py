@@ -93,6 +93,7 @@ def test_every_mode_measures_every_stage_of_every_image(rows: dict[str, benchmar
         assert all(one.cpu_s > 0 and one.wall_s > 0 and one.peak_bytes > 2**27 for one in row.costs.values())
 
 
+@pytest.mark.slow
 def test_float32_modes_say_the_same_and_bfloat16_nearly(rows: dict[str, benchmark.Row]) -> None:
     assert rows["float32"].errors is None
     for mode in ("published", "norm_y"):
@@ -175,6 +176,7 @@ def test_made_up_surface_is_one_that_cameras_can_be_fitted_to() -> None:
 
 
 # ------------------------------------------------------------------------------ the script
+@pytest.mark.slow
 def test_ratios_are_those_to_the_first_mode(rows: dict[str, benchmark.Row]) -> None:
     twice = {
         name: replace(one, wall_s=3 * one.wall_s, cpu_s=2 * one.cpu_s) for name, one in rows["published"].costs.items()
@@ -201,6 +203,7 @@ def test_script_measures_in_a_process_of_its_own_and_writes_its_figures(
     assert f"{row['costs']['encode']['cpu_s'] / 2:.3f}" in printed
 
 
+@pytest.mark.slow
 def test_table_of_errors_leaves_out_the_mode_that_others_are_compared_with(rows: dict[str, benchmark.Row]) -> None:
     header, _, *lines = benchmark.error_table(list(rows.values())).splitlines()
     assert [cell.strip() for cell in header.split("|")[1:-1]] == ["error", "published", "bfloat16", "norm_y"]
