@@ -20,8 +20,8 @@ from smust3r_colmap.refinement.linearised_model import LinearisedModel
 from smust3r_colmap.refinement.links import Link, links
 from smust3r_colmap.refinement.misregistration import EpipolarSupport
 
-MIN_IMAGES = 3
-"""Two centres fit any other two after a similarity, so that a smaller model has no uncertainty to speak of."""
+MIN_IMAGES = 2
+"""A single image has no other to be uncertain against."""
 MAX_WEAK_LINKS = 3
 """Of the summary."""
 MAX_DETERMINED = 0.5 * UNBOUNDED
@@ -163,7 +163,7 @@ def adjusted_priors(model: pycolmap.Reconstruction, uncertainty: ModelUncertaint
 def _without_shape(
     linear: LinearisedModel, names: tuple[str, ...], inflation: FloatArray, counts: IntArray
 ) -> ModelUncertainty:
-    """Of one or two images: they fit any truth, so that nothing about them is determined but that."""
+    """Of a single image, or none: it fits any truth, so that nothing about it is determined."""
     n = len(linear)
     return ModelUncertainty(
         names=names,

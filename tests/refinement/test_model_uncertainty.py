@@ -116,7 +116,7 @@ DEGENERATE = {
         cam_from_world_towards(np.eye(8, 3) * [1.0, 0, 0], np.array([0.0, 0, 5])), in_front(rng, 5.0)
     ),
 }
-BOUNDED = {"points on a plane", "centres on a line", "equal centres but one"}
+BOUNDED = {"points on a plane", "centres on a line", "equal centres but one", "two images"}
 
 
 @pytest.mark.parametrize("name", DEGENERATE)
