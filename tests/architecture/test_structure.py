@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 from pathlib import Path
 
 import pytest
@@ -96,3 +97,33 @@ def test_circles_and_upward_imports_are_seen(tmp_path: Path) -> None:
     found = arrows(tmp_path)
     assert set(found) == {("a", "b"), ("b", "c"), ("c", "a")}
     assert circles(found) == [("a", "b", "c")]
+
+
+INDEX_NAMES = {"a", "b", "i", "j", "first", "second", "image", "image_id", "other"}
+"""Names of image indices; two of them are neighbours if the view graph says so, not if they differ by one."""
+
+
+def index_differences(tree: ast.AST) -> list[int]:
+    """Lines with ``abs(i - j)`` of two image indices."""
+    return [
+        node.lineno
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
+        and ast.unparse(node.func) in ("abs", "np.abs")
+        and isinstance(node.args[0], ast.BinOp)
+        and isinstance(node.args[0].op, ast.Sub)
+        and all(
+            isinstance(side, ast.Name) and side.id in INDEX_NAMES for side in (node.args[0].left, node.args[0].right)
+        )
+    ]
+
+
+def test_neighbours_are_asked_of_the_view_graph() -> None:
+    found = {
+        module: lines
+        for module, path in modules().items()
+        if room_of(module) in (*STAGES, "exporters", "report")
+        and (lines := index_differences(ast.parse(path.read_text(encoding="utf-8"))))
+    }
+    assert not found
+    assert index_differences(ast.parse("near = min(anchors, key=lambda i: abs(i - image_id))")) == [1]
