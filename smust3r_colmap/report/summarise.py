@@ -71,6 +71,8 @@ def reconstruction(
         edges=summarise_edges(edges, result.submodels),
         loops=summarise_loops(segments.loops, stitched.stitching, collection),
         loops_note=segments.loops.note,
+        num_keyframes=len(collection) - len(segments.others),
+        order=segments.order,
         graph=summarise_graph(stitched),
         peak_memory_bytes=peak_memory_bytes(),
         refinements=() if refinement is None else refinement.results,

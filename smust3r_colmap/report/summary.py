@@ -75,6 +75,9 @@ class RunSummary:
         output: the output folder.
         num_images: images that could be read.
         num_registered: distinct images with a pose in at least one model.
+        num_keyframes: images that were reconstructed in segments; the others were registered to the refined model.
+            None where nothing was segmented.
+        order: whether the images are a sequence, and why; empty where nothing was segmented.
         models: largest first.
         rejected: files that could not be used.
         unregistered: images that were read but have no pose in any model.
@@ -108,6 +111,8 @@ class RunSummary:
     refinements: tuple[SceneRefinement, ...] = ()
     missing_outputs: tuple[MissingOutput, ...] = ()
     notes: tuple[str, ...] = ()
+    num_keyframes: int | None = None
+    order: str = ""
 
     def __post_init__(self) -> None:
         if not self.models:

@@ -43,6 +43,7 @@ class Segments:
         windows: of its sequence, or clusters of images in no order; ``windows[k].index == k``.
         loops: that were planned; their segments are numbered on from the windows.
         others: images that are no keyframes: in no segment, and registered to the refined model.
+        order: whether the images are a sequence, and why.
         unconnected: images that are in no segment, because they match too few others.
     """
 
@@ -50,6 +51,7 @@ class Segments:
     windows: tuple[Segment, ...]
     loops: LoopPlan
     others: tuple[int, ...] = ()
+    order: str = ""
     unconnected: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -113,8 +115,10 @@ def plan(
     order = decide_order(names, keyframes, _without(describe(), others) if is_long else None, options.order)
     run.clock.note(f"order: {order.reason}")
     if order.is_one_sequence:
-        return _of_sequence(run, order.chain, others, describe, options, config.loop_closing)
-    return _of_view_graph(run, collection, order.chain, others, describe, config)
+        segments = _of_sequence(run, order.chain, others, describe, options, config.loop_closing)
+    else:
+        segments = _of_view_graph(run, collection, order.chain, others, describe, config)
+    return replace(segments, order=order.reason)
 
 
 def _keyframes(run: Run, collection: ImageCollection, config: RunConfig) -> tuple[int, ...]:
