@@ -117,7 +117,8 @@ def look_alike_pairs(
     task = RotationTask(
         database=features.database,
         pairs=tested,
-        cameras={k: collection.cameras[image.camera] for k, image in enumerate(collection.images)},
+        cameras=collection.cameras,
+        camera_of={k: image.camera for k, image in enumerate(collection.images)},
         seed=run.seed,
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -80,7 +81,8 @@ def task(tmp_path: Path) -> RotationTask:
     return RotationTask(
         database=tmp_path / "features.db",
         pairs=tuple(sorted(matches)),
-        cameras=dict.fromkeys(range(NUM_IMAGES), CAMERA),
+        cameras=(CAMERA,),
+        camera_of=dict.fromkeys(range(NUM_IMAGES), 0),
         seed=0,
     )
 
@@ -95,10 +97,10 @@ def test_pairs_between_look_alike_walls_are_far_from_all_others(task: RotationTa
 def test_every_connected_component_is_averaged_by_itself(task: RotationTask) -> None:
     left, right = set(range(1, 10)), set(range(13, 22))
     inside = tuple(pair for pair in task.pairs if set(pair) <= left or set(pair) <= right)
-    errors = rotation_errors_deg(RotationTask(database=task.database, pairs=inside, cameras=task.cameras, seed=0))
+    errors = rotation_errors_deg(replace(task, pairs=inside))
     assert np.isfinite(errors).all()
     assert errors.max() < 5
 
 
 def test_no_pairs(task: RotationTask) -> None:
-    assert rotation_errors_deg(RotationTask(database=task.database, pairs=(), cameras={}, seed=0)).shape == (0,)
+    assert rotation_errors_deg(replace(task, pairs=())).shape == (0,)
