@@ -32,6 +32,9 @@ MAX_ROTATION_ERROR_DEG = 20.0
 have more and 16 of 2,700 true ones, of ``courthouse_walk`` 287 of 437 and 75 of 2,400; false ones with less have few
 matches."""
 
+METHOD_VERSION = 2
+"""To be raised when the pairs found may change, so that finished folders look again."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RotationTask:

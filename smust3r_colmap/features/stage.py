@@ -19,7 +19,12 @@ from smust3r_colmap.execution.task_pool import TaskFailure, in_child
 from smust3r_colmap.features.guided_verification import MIN_VERIFIED
 from smust3r_colmap.features.matching import drop_matches_without_evidence, find_static_parts, match_pairs
 from smust3r_colmap.features.pairs import alike_pairs, neighbouring_pairs
-from smust3r_colmap.features.rotation_consistency import MAX_ROTATION_ERROR_DEG, RotationTask, rotation_errors_deg
+from smust3r_colmap.features.rotation_consistency import (
+    MAX_ROTATION_ERROR_DEG,
+    METHOD_VERSION,
+    RotationTask,
+    rotation_errors_deg,
+)
 from smust3r_colmap.features.sift import extract_features
 from smust3r_colmap.features.stationary import NO_REGIONS, StaticRegions, describe
 from smust3r_colmap.features.vlad import FEATURES_PER_IMAGE, vlad_descriptors
@@ -130,7 +135,8 @@ def look_alike_pairs(
         return tuple(tested[k] for k in np.flatnonzero(errors_deg > MAX_ROTATION_ERROR_DEG))
 
     try:
-        found = run.cached("look_alikes", (features.key, tested, run.seed), compute, _PAIRS, title="look-alikes")
+        inputs = (METHOD_VERSION, features.key, tested, run.seed)
+        found = run.cached("look_alikes", inputs, compute, _PAIRS, title="look-alikes")
     except ReconstructionError as error:  # not stored, so that the next start tries again
         run.clock.warn(f"look-alike places were not looked for: {error}")
         return ()
