@@ -68,7 +68,7 @@ def test_the_camera_is_the_adjusted_one_and_its_focal_length_is_trusted(
     assert camera.has_prior_focal_length
 
 
-def test_every_placed_image_has_a_prior_near_its_place(
+def test_every_placed_image_has_a_prior_at_its_place_with_a_covariance_of_its_own(
     database: pycolmap.Database, model: pycolmap.Reconstruction, finished_example: Example
 ) -> None:
     priors = {prior.corr_data_id.id: prior for prior in database.read_all_pose_priors()}
@@ -76,10 +76,12 @@ def test_every_placed_image_has_a_prior_near_its_place(
     for image_id, prior in priors.items():
         assert prior.coordinate_system == pycolmap.PosePriorCoordinateSystem.CARTESIAN
         distance = np.linalg.norm(prior.position - model.image(image_id).projection_center())
-        assert 0 < distance < 0.03 * finished_example.world.extent
-        sigma = np.sqrt(np.diag(prior.position_covariance))
-        assert np.allclose(sigma, sigma[0])
-        assert 0.005 < sigma[0] / finished_example.world.extent < 0.02
+        assert distance < 1e-9 * finished_example.world.extent
+        variances = np.linalg.eigvalsh(prior.position_covariance)
+        np.testing.assert_allclose(prior.position_covariance, prior.position_covariance.T)
+        assert variances.min() > 0
+        assert 1e-5 < np.sqrt(variances.sum()) / finished_example.world.extent < 0.02
+    assert len({prior.position_covariance.tobytes() for prior in priors.values()}) == len(priors)
 
 
 def test_two_view_geometries_hold_the_matches_and_the_poses_of_the_model(

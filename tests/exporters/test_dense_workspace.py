@@ -188,7 +188,9 @@ def test_names_that_cfg_files_cannot_hold_are_renamed(tmp_path: Path, pictures: 
     assert len(lines) == len(NAMES)
     assert all(line == line.strip() and not line.startswith("#") for line in lines)
     assert all((tmp_path / "dense/images" / line).is_file() for line in lines)
-    assert len(trimesh.load(tmp_path / "dense/fused.ply").vertices) > 0
+    cloud = trimesh.load(tmp_path / "dense/fused.ply")
+    assert isinstance(cloud, trimesh.PointCloud)
+    assert len(cloud.vertices) > 0
 
 
 def test_the_report_counts_what_is_there(written: Written) -> None:

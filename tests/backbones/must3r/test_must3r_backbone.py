@@ -210,7 +210,7 @@ def test_all_strategies_and_fits_predict_every_image_once(
     predictor: Callable[..., Must3rPredictor], keyframes: KeyframeStrategy, camera_fit: CameraFit
 ) -> None:
     stage = stage_of(6)
-    made = predictor(keyframes=keyframes, camera_fit=camera_fit, max_keyframes=4, refinements=1)
+    made = predictor(network_keyframes=keyframes, camera_fit=camera_fit, max_keyframes=4, refinements=1)
     prediction = made.predict(SEGMENT, stage)
     spoken_of = [one.image for one in prediction.images] + [one.image for one in prediction.unregistered]
     assert sorted(spoken_of) == list(SEGMENT.images)
