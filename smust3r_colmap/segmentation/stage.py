@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import pairwise
 
 from smust3r_colmap.config import LoopConfig, RunConfig, SegmentationConfig
@@ -109,6 +110,7 @@ def plan(
     """
     keyframes = _keyframes(run, collection, config)
     others = tuple(sorted({*range(len(collection))} - {*keyframes}))
+    describe = cache(describe)
     options = config.segmentation
     is_long = options.order == "auto" and len(keyframes) > config.features.exhaustive_below
     names = [image.name for image in collection.images]
