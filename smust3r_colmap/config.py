@@ -76,9 +76,9 @@ class SegmentationConfig:
     order: Order = "auto"
     """Whether images that follow each other in name order show the same place: sequence, or unordered; auto decides by
     their likeness, folder by folder."""
-    keyframes: int | Literal["auto", "all"] = "auto"
+    keyframes: int | Literal["auto", "all"] = "all"
     """Images that carry the reconstruction: all of them, so many, or those between which a video moves enough (auto).
-    The others are registered to the refined model."""
+    The others are registered to the refined model, which may take long where they are many."""
     segment_length: int = 60
     """Images per segment (l); the paper's setting."""
     overlap: int = 20
