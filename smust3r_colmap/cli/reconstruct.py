@@ -18,7 +18,7 @@ class Reconstruct:
     """Reconstruct images or videos; start the same command again to go on after an interruption."""
 
     images: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IMAGES")]
-    """Folder of images, in the order of their names, and of videos; or a video."""
+    """Folder of images and videos; or a video."""
     output: Annotated[Path, tyro.conf.arg(metavar="OUT")]
     """Folder of the result; made when missing."""
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None
