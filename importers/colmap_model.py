@@ -103,16 +103,16 @@ def read_colmap_model(folder: Path) -> ExternalModel:
     """
     fixes = Fixes()
     records = read_records(folder, fixes)
-    images = [_by_frame(record, records.poses_by_frame, fixes) for record in records.images]
+    images = [by_frame(record, records.poses_by_frame, fixes) for record in records.images]
     posed = [record for record in images if np.isfinite(record.numbers).all()]
     if len(posed) < MIN_IMAGES:
         raise InputError(
             f"{records.folder}: {len(posed)} of {len(records.images)} images have a pose, needed are {MIN_IMAGES}"
         )
-    _refuse_twins([(record.camera_id, record.place) for record in records.cameras], "camera id")
-    _refuse_twins([(record.image_id, record.place) for record in records.images], "image id")
-    names = [_tidy_name(record, fixes) for record in posed]
-    _refuse_twins([(name, record.place) for name, record in zip(names, posed, strict=True)], "image name")
+    refuse_twins([(record.camera_id, record.place) for record in records.cameras], "camera id")
+    refuse_twins([(record.image_id, record.place) for record in records.images], "image id")
+    names = [tidy_name(record, fixes) for record in posed]
+    refuse_twins([(name, record.place) for name, record in zip(names, posed, strict=True)], "image name")
     cameras = {record.camera_id: record for record in records.cameras}
     first_image_of = {record.camera_id: record for record in reversed(posed)}
     intrinsics = {camera_id: _intrinsics(cameras, image, fixes) for camera_id, image in sorted(first_image_of.items())}
@@ -121,7 +121,7 @@ def read_colmap_model(folder: Path) -> ExternalModel:
         names=tuple(names),
         camera_ids=tuple(record.camera_id for record in posed),
         cameras=intrinsics,
-        cam_from_world=np.stack([_cam_from_world(record, fixes) for record in posed]),
+        cam_from_world=np.stack([cam_from_world_of(record, fixes) for record in posed]),
         surface=_surface(records.points, [record.image_id for record in posed], records.folder, fixes),
         unposed=tuple(
             RejectedImage(name=record.name, reason=f"its pose in the model is not finite ({record.place})")
@@ -134,7 +134,8 @@ def read_colmap_model(folder: Path) -> ExternalModel:
     return model
 
 
-def _refuse_twins(keys: Sequence[tuple[Hashable, str]], what: str) -> None:
+def refuse_twins(keys: Sequence[tuple[Hashable, str]], what: str) -> None:
+    """Refuse keys, each with its place, of which two are the same."""
     place_of: dict[Hashable, str] = {}
     for key, place in keys:
         if key in place_of:
@@ -142,7 +143,7 @@ def _refuse_twins(keys: Sequence[tuple[Hashable, str]], what: str) -> None:
         place_of[key] = place
 
 
-def _by_frame(record: ImageRecord, poses: Mapping[int, Pose], fixes: Fixes) -> ImageRecord:
+def by_frame(record: ImageRecord, poses: Mapping[int, Pose], fixes: Fixes) -> ImageRecord:
     """With the pose of its frame where the line of the image says another, as COLMAP reads it."""
     numbers = poses.get(record.image_id)
     if numbers is None or is_same_pose(record.numbers, numbers):
@@ -153,7 +154,7 @@ def _by_frame(record: ImageRecord, poses: Mapping[int, Pose], fixes: Fixes) -> I
     return replace(record, numbers=numbers)
 
 
-def _tidy_name(record: ImageRecord, fixes: Fixes) -> str:
+def tidy_name(record: ImageRecord, fixes: Fixes) -> str:
     """With forward slashes, as names are in COLMAP."""
     fixes.note("image names with backslashes", record.place, count="\\" in record.name)
     name = record.name.replace("\\", "/")
@@ -194,7 +195,7 @@ def _intrinsics(cameras: Mapping[int, CameraRecord], image: ImageRecord, fixes: 
     return replace(intrinsics, params=mended.params)
 
 
-def _cam_from_world(record: ImageRecord, fixes: Fixes) -> FloatArray:
+def cam_from_world_of(record: ImageRecord, fixes: Fixes) -> FloatArray:
     """(3, 4), the rotation being that of the nearest unit quaternion."""
     quat_wxyz, translation = np.asarray(record.numbers[:4]), np.asarray(record.numbers[4:])
     length = float(np.linalg.norm(quat_wxyz))

@@ -117,23 +117,42 @@ def read_records(folder: Path, fixes: Fixes) -> ModelRecords:
         InputError: there is no model, or a file cannot be read; names file, line and number.
     """
     place, suffix = _find_model(folder)
-    points = place / f"points3D{suffix}"
-    cameras, images = place / f"cameras{suffix}", place / f"images{suffix}"
+    points, cameras = place / f"points3D{suffix}", place / f"cameras{suffix}"
+    images, poses_by_frame = _images(place, suffix, fixes)
     if suffix == ".bin":
-        return ModelRecords(
-            folder=place,
-            cameras=tuple(_binary_cameras(_Cursor(cameras, fixes))),
-            images=tuple(_binary_images(_Cursor(images, fixes))),
-            points=_binary_points(_Cursor(points, fixes)) if points.exists() else None,
-            poses_by_frame=poses_by_image(place, suffix),
-        )
+        read_cameras = tuple(_binary_cameras(_Cursor(cameras, fixes)))
+        read_points = _binary_points(_Cursor(points, fixes)) if points.exists() else None
+    else:
+        read_cameras = tuple(_text_cameras(cameras))
+        read_points = _text_points(points, fixes) if points.exists() else None
     return ModelRecords(
-        folder=place,
-        cameras=tuple(_text_cameras(cameras)),
-        images=tuple(_text_images(images, fixes)),
-        points=_text_points(points, fixes) if points.exists() else None,
-        poses_by_frame=poses_by_image(place, suffix),
+        folder=place, cameras=read_cameras, images=images, points=read_points, poses_by_frame=poses_by_frame
     )
+
+
+def read_image_records(folder: Path, fixes: Fixes) -> tuple[tuple[ImageRecord, ...], Mapping[int, Pose]]:
+    """The images alone, and their poses by rigs and frames; the model is looked for as by ``read_records``.
+
+    Raises:
+        InputError: as ``read_records``.
+    """
+    place, suffix = _find_model(folder)
+    return _images(place, suffix, fixes)
+
+
+def _images(place: Path, suffix: str, fixes: Fixes) -> tuple[tuple[ImageRecord, ...], Mapping[int, Pose]]:
+    path = place / f"images{suffix}"
+    records = _binary_images(_Cursor(path, fixes)) if suffix == ".bin" else _text_images(path, fixes)
+    return tuple(records), poses_by_image(place, suffix)
+
+
+def holds_model(folder: Path) -> bool:
+    """Whether cameras and images of a model lie in this very folder."""
+    return any(_holds(folder, suffix) for suffix in (".bin", ".txt"))
+
+
+def _holds(folder: Path, suffix: str) -> bool:
+    return all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images"))
 
 
 def _find_model(folder: Path) -> tuple[Path, str]:
@@ -141,7 +160,7 @@ def _find_model(folder: Path) -> tuple[Path, str]:
         raise InputError(f"{folder}: {'is a file' if folder.exists() else 'there is no such folder'}; name a model's")
     for below in _WHERE_MODELS_LIE:
         for suffix in (".bin", ".txt"):
-            if all((folder / below / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
+            if _holds(folder / below, suffix):
                 return folder / below, suffix
     found = sorted(entry.name for entry in folder.iterdir())[:5]
     raise InputError(

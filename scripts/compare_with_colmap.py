@@ -52,10 +52,12 @@ from plot_trajectory import read_tum_by_name
 
 from smust3r_colmap.config import SegmentationConfig
 from smust3r_colmap.errors import DegenerateAlignmentError
-from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse, read_transforms_json
 from smust3r_colmap.evaluation.trajectory import Evaluation, Trajectory, compare_trajectories
 from smust3r_colmap.execution.task_pool import usable_cores
 from smust3r_colmap.importers.image_folder import natural_key
+from smust3r_colmap.importers.model_poses import read_model_poses
+from smust3r_colmap.importers.poses_txt import read_poses_txt
+from smust3r_colmap.importers.transforms_poses import read_transforms_json
 
 DATA = Path(os.environ.get("SMUST3R_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 SUBSET_FILE = "subset_every5.txt"
@@ -169,7 +171,7 @@ def read_truth(folder: Path) -> tuple[dict[str, Any], str]:
         return read_poses_txt(folder / "poses.txt"), "m"
     if (folder / "transforms.json").exists():
         return read_transforms_json(folder / "transforms.json"), "units"
-    return read_reference_sparse(folder / "reference_sparse"), "units"
+    return read_model_poses(folder / "reference_sparse"), "units"
 
 
 def work_folder(dataset: Dataset, output: Path) -> Path:
@@ -272,7 +274,7 @@ def effect_of_stages(dataset: Dataset, output: Path, result: Result) -> dict[str
 def judge(method: str, dataset: Dataset, sparse: Path, costs: dict[str, Cost]) -> Result:
     """Measure the largest model in a folder of models, and compare it with the truth."""
     folders = [folder for folder in sorted(sparse.glob("*")) if any(folder.glob("images.*"))]
-    models = sorted(((read_reference_sparse(folder), folder) for folder in folders), key=lambda one: -len(one[0]))
+    models = sorted(((read_model_poses(folder), folder) for folder in folders), key=lambda one: -len(one[0]))
     notes = [f"{stage}: exit code {cost.exit_code}" for stage, cost in costs.items() if cost.exit_code]
     evaluation, figures = None, None
     largest: Trajectory = {}

@@ -29,11 +29,12 @@ import pycolmap
 from benchmark_plane_sweep import COLOUR_FROM_SENSOR
 
 from smust3r_colmap.errors import InputError, SmustrError
-from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.importers.model_poses import read_model_poses
+from smust3r_colmap.importers.poses_txt import read_poses_txt
 from smust3r_colmap.synthetic.truth import TrueScene, z_buffer
 
 FloatMap = npt.NDArray[np.float32]
@@ -204,7 +205,7 @@ def similarity_scale(sparse: Path, data: Path, view_from_sensor: FloatArray) -> 
     """Metres per unit of the model, from the places of the cameras."""
     sensor_from_view = np.vstack([invert_rigid(view_from_sensor), [0.0, 0.0, 0.0, 1.0]])
     truth = {name: pose @ sensor_from_view for name, pose in read_poses_txt(data / "poses.txt").items()}
-    similarity = compare_trajectories(read_reference_sparse(sparse), truth).reference_from_estimated
+    similarity = compare_trajectories(read_model_poses(sparse), truth).reference_from_estimated
     return float(similarity.scale)
 
 

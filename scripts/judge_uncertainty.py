@@ -27,12 +27,15 @@ from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.colmap.reconstruction import poses_of
 from smust3r_colmap.errors import InputError, SmustrError
-from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse
+from smust3r_colmap.evaluation.absolute_error import position_errors
+from smust3r_colmap.evaluation.predicted_error import PredictedErrors
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.features.guided_verification import View, read_matched_features
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.importers.model_poses import read_model_poses
+from smust3r_colmap.importers.poses_txt import read_poses_txt
 from smust3r_colmap.refinement.acceptance import MAX_ERROR_PX
 from smust3r_colmap.refinement.bundle_adjustment import MIN_ANGLE_DEG, extent_of
 from smust3r_colmap.refinement.contradictions import point_support
@@ -59,9 +62,10 @@ class Judged:
     errors: FloatArray
     sigmas: FloatArray
 
-    def within(self, sigmas: float) -> float:
-        """Percent of the images whose error is within so many standard deviations."""
-        return float(100 * np.mean(self.errors <= sigmas * self.sigmas))
+    @property
+    def figures(self) -> PredictedErrors:
+        """How large they are, and how often the true ones are within multiples of the predicted."""
+        return PredictedErrors.of(self.errors, self.sigmas)
 
 
 def judge(run: Path, data: Path, *, spoil: str = "", calibrated: bool = False) -> Judged:
@@ -81,15 +85,15 @@ def judge(run: Path, data: Path, *, spoil: str = "", calibrated: bool = False) -
     estimated = {image.name: invert_rigid(image.cam_from_world().matrix()) for image in _registered(model)}
     fit = compare_trajectories(estimated, world_from_cam_true).reference_from_estimated
     names = [name for name in uncertainty.names if name in world_from_cam_true]
-    moved = fit.move_cameras(np.stack([estimated[name] for name in names]))[:, :, 3]
-    true = np.stack([world_from_cam_true[name][:, 3] for name in names])
+    moved = fit.move_cameras(np.stack([estimated[name] for name in names]))
+    true = np.stack([world_from_cam_true[name] for name in names])
     extent = uncertainty.extent * float(fit.scale)
     sigma_of = dict(zip(uncertainty.names, uncertainty.position_sigma / uncertainty.extent, strict=True))
     own = np.sqrt(2) if is_reference else 1.0
     return Judged(
         name=data.name,
         uncertainty=uncertainty,
-        errors=np.linalg.norm(moved - true, axis=1) / extent,
+        errors=position_errors(moved, true) / extent,
         sigmas=own * np.array([sigma_of[name] for name in names]),
     )
 
@@ -102,7 +106,7 @@ def _truth(data: Path) -> tuple[dict[str, FloatArray], bool]:
     """``world_from_cam`` by name, and whether it is a reference model."""
     if (data / "poses.txt").is_file():
         return read_poses_txt(data / "poses.txt"), False
-    return read_reference_sparse(data / "reference_sparse"), True
+    return read_model_poses(data / "reference_sparse"), True
 
 
 def measure(model: pycolmap.Reconstruction, database: Path, *, calibrated: bool) -> ModelUncertainty:
@@ -162,17 +166,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SmustrError as error:
         print(f"judge_uncertainty: {error}", file=sys.stderr)
         return 2
-    together = [
-        100 * np.mean(np.concatenate([one.errors <= sigmas * one.sigmas for one in judged])) for sigmas in (1, 2, 3)
-    ]
-    print("all images together: within 1, 2, 3 sigma: " + ", ".join(f"{share:.0f} %" for share in together))
+    together = PredictedErrors.of(
+        *(np.concatenate([getattr(one, name) for one in judged]) for name in ("errors", "sigmas"))
+    )
+    print("all images together: within 1, 2, 3 sigma: " + ", ".join(f"{share:.0f} %" for share in together.within))
     return 0
 
 
 def _line(one: Judged) -> str:
     level, reasons = verdict_of(one.uncertainty)
-    true, predicted = (100 * np.sqrt(np.mean(values**2)) for values in (one.errors, one.sigmas))
-    shares = ", ".join(f"{one.within(sigmas):.0f} %" for sigmas in (1, 2, 3))
+    true, predicted = 100 * one.figures.true_rmse, 100 * one.figures.predicted_rmse
+    shares = ", ".join(f"{share:.0f} %" for share in one.figures.within)
     head = f"{one.name}: true {true:.3f} %, predicted {predicted:.3f} % of the extent; within 1, 2, 3 sigma: {shares}"
     return "\n".join([f"{head}; {level}", *(f"    {reason}" for reason in reasons)])
 

@@ -26,9 +26,11 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.errors import InputError
-from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse, read_transforms_json
 from smust3r_colmap.evaluation.trajectory import Trajectory, compare_trajectories
 from smust3r_colmap.geometry.arrays import FloatArray
+from smust3r_colmap.importers.model_poses import read_model_poses
+from smust3r_colmap.importers.poses_txt import read_poses_txt
+from smust3r_colmap.importers.transforms_poses import read_transforms_json
 
 Trajectories = Mapping[str, Trajectory]
 
@@ -113,7 +115,7 @@ def _images(run: Path) -> list[pycolmap.Image]:
 def read_truth(path: Path) -> dict[str, FloatArray]:
     """``world_from_cam`` by name, from whatever the path is."""
     if path.is_dir():
-        return read_reference_sparse(path)
+        return read_model_poses(path)
     return read_transforms_json(path) if path.suffix == ".json" else read_poses_txt(path)
 
 

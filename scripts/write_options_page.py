@@ -21,6 +21,7 @@ import tyro
 
 from smust3r_colmap.cli.demo import Demo
 from smust3r_colmap.cli.doctor import Doctor
+from smust3r_colmap.cli.evaluate import Evaluate
 from smust3r_colmap.cli.export import Export
 from smust3r_colmap.cli.frames import Frames
 from smust3r_colmap.cli.presets import PRESETS
@@ -38,6 +39,7 @@ COMMANDS: Mapping[str, type] = {
     "frames": Frames,
     "export": Export,
     "validate": Validate,
+    "evaluate": Evaluate,
     "demo": Demo,
     "doctor": Doctor,
     "weights list": ListWeights,

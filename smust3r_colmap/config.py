@@ -29,6 +29,10 @@ ConfidenceWeighting = Literal["relative", "paper", "off"]
 RobustKernel = Literal["cauchy", "tukey", "huber"]
 TrackSource = Literal["features", "pointmaps", "both"]
 MeshMethod = Literal["none", "poisson", "tsdf"]
+PoseLayout = Literal["tum", "eth3d-slam", "7-scenes", "kitti", "euroc", "poses-txt", "transforms", "colmap"]
+PoseAlignment = Literal["sim3", "se3", "none"]
+AssociationKey = Literal["auto", "name", "number", "time"]
+DeltaUnit = Literal["frames", "m"]
 
 MAX_POSE_TOLERANCE = 0.2
 """Beyond it hardly a match is refused, and the poses count for nothing."""
@@ -378,6 +382,43 @@ class RefineConfig:
             )
         _check_workers(self.workers)
         _check_at_least(self, seed=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig:
+    """How an estimate is compared with a reference."""
+
+    align: PoseAlignment = "sim3"
+    """What brings the estimate into the frame of the reference: a fit of the camera centres, with scale or without."""
+    associate: AssociationKey = "auto"
+    """How poses are matched: by image name, frame number or time; auto takes the first that both sides have."""
+    max_time_difference: float = 0.01
+    """Seconds between two poses that are matched by time; evo's default."""
+    time_offset: float = 0.0
+    """Seconds added to the times of the estimate."""
+    rpe_delta: float = 1.0
+    """Step of the relative pose error."""
+    rpe_unit: DeltaUnit = "frames"
+    """Unit of the step: compared poses, or length of the path of the reference."""
+    rpe_all_pairs: bool = False
+    """A step from every pose, not one step after the other."""
+    reference_accuracy: float = 0.0
+    """Of the positions of the reference, in its unit; for auc_colmap, shorter baselines have no direction."""
+    unit: str = ""
+    """Unit of length of the reference, such as m, where its layout does not say; KITTI's segments need m."""
+    cloud_thresholds: tuple[float, ...] = (0.01, 0.02, 0.05)
+    """Distances that accuracy, completeness and F-score of clouds are given for, in the unit of the reference."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.rpe_delta < math.inf or (self.rpe_unit == "frames" and self.rpe_delta != round(self.rpe_delta)):
+            raise ConfigError(f"--rpe-delta {self.rpe_delta:g}: must be above 0, and a whole number of frames")
+        for name in ("max_time_difference", "reference_accuracy"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ConfigError(f"--{name.replace('_', '-')} {getattr(self, name):g}: must be 0 or more")
+        if not math.isfinite(self.time_offset):
+            raise ConfigError(f"--time-offset {self.time_offset:g}: must be a number of seconds")
+        if not all(0 < one < math.inf for one in self.cloud_thresholds):
+            raise ConfigError(f"--cloud-thresholds {self.cloud_thresholds}: must be above 0")
 
 
 def _check_at_least(settings: object, **least: int) -> None:

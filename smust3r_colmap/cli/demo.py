@@ -45,8 +45,9 @@ def run_demo(command: Demo) -> int:
 
 
 def _demo(command: Demo, reporter: Reporter) -> int:
-    from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse  # noqa: PLC0415
     from smust3r_colmap.evaluation.trajectory import compare_trajectories  # noqa: PLC0415
+    from smust3r_colmap.importers.model_poses import read_model_poses  # noqa: PLC0415
+    from smust3r_colmap.importers.poses_txt import read_poses_txt  # noqa: PLC0415
     from smust3r_colmap.pipeline import reconstruct  # noqa: PLC0415
     from smust3r_colmap.synthetic.room import write_demo  # noqa: PLC0415  (heavy: --help shall not pay for it)
 
@@ -64,7 +65,7 @@ def _demo(command: Demo, reporter: Reporter) -> int:
     summary = reconstruct(images, result, _DEMO_SETTINGS, reporter=reporter)
     tell(summary, reporter, quiet=command.quiet)
     model = result / summary.models[0].folder
-    distance = compare_trajectories(read_reference_sparse(model), truth)
+    distance = compare_trajectories(read_model_poses(model), truth)
     print(f"Cameras of {model} against the truth in {truth_file}:\n  {distance.render_text('m')}")
     if distance.position_rmse_percent > _DEMO_MAX_PERCENT:
         reporter.warn(f"that is more than {_DEMO_MAX_PERCENT:.0f} %: the result is wrong")

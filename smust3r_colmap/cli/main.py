@@ -22,6 +22,7 @@ from smust3r_colmap import __version__
 from smust3r_colmap.cli.console import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_WRONG_USE, fail
 from smust3r_colmap.cli.demo import Demo, run_demo
 from smust3r_colmap.cli.doctor import Doctor, run_doctor
+from smust3r_colmap.cli.evaluate import Evaluate, run_evaluate
 from smust3r_colmap.cli.export import Export, run_export
 from smust3r_colmap.cli.fields import REGISTRY
 from smust3r_colmap.cli.frames import Frames, run_frames
@@ -40,9 +41,9 @@ _DESCRIPTION = """Offline structure from motion for COLMAP workflows, segment by
 Exit codes: 0 good, 1 failed, 2 wrong use, 3 finished with warnings, 130 interrupted.
 --version prints the version."""
 
-Command = Reconstruct | Refine | Frames | Export | Validate | Demo | Doctor | WeightsCommand
+Command = Reconstruct | Refine | Frames | Export | Validate | Evaluate | Demo | Doctor | WeightsCommand
 
-COMMANDS = ("reconstruct", "refine", "frames", "export", "validate", "demo", "doctor", "weights")
+COMMANDS = ("reconstruct", "refine", "frames", "export", "validate", "evaluate", "demo", "doctor", "weights")
 SETTINGS = {"reconstruct": RunConfig, "refine": RefineConfig}
 """The commands that take a settings file, and what it may hold."""
 
@@ -128,6 +129,8 @@ def _run(command: Command) -> int:  # noqa: PLR0911  (one return per command)
             return run_export(command)
         case Validate():
             return run_validate(command)
+        case Evaluate():
+            return run_evaluate(command)
         case Demo():
             return run_demo(command)
         case Doctor():

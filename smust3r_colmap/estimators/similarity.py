@@ -18,7 +18,7 @@ from smust3r_colmap.geometry.so3 import nearest_rotation
 
 # Centres spread less than this across their main direction, relative to along it, do not determine
 # the roll: an error of 0.1 % of the length would turn it by more than a degree.
-_MIN_RELATIVE_WIDTH = 0.05
+MIN_RELATIVE_WIDTH = 0.05
 # Below this the spread is rounding.
 _MIN_RELATIVE_EXTENT = 1e-9
 
@@ -87,6 +87,29 @@ def fit_similarity(points_a: FloatArray, points_b: FloatArray, weights: FloatArr
     return pairs.similarity(rotation, pairs.least_squares_scale(rotation, weights))
 
 
+def fit_centres(estimated: FloatArray, reference: FloatArray, *, with_scale: bool) -> Sim3:
+    """``reference_from_estimated`` of centres (N, 3) with the least squared distances.
+
+    The scale is 1 unless ``with_scale``.
+
+    Centres on a line leave the rotation about it free; ``relative_width`` says how near they are to that.
+
+    Raises:
+        DegenerateAlignmentError: all centres of a side coincide, or the best scale is not positive.
+    """
+    pairs = CentredPairs.of(estimated, reference)
+    _spread(pairs.a, pairs.mean_a, "estimate")
+    _spread(pairs.b, pairs.mean_b, "reference")
+    rotation = nearest_rotation(pairs.correlation())
+    return pairs.similarity(rotation, _positive(pairs.least_squares_scale(rotation)) if with_scale else 1.0)
+
+
+def relative_width(centres: FloatArray) -> float:
+    """Spread of centres (N, 3) across their main direction, over that along it; 0 where they are on a line."""
+    lengths = np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False)
+    return float(lengths[1] / lengths[0]) if lengths[0] > 0 else 0.0
+
+
 def fit_camera_similarity(estimated: FloatArray, reference: FloatArray) -> tuple[Sim3, str]:
     """``reference_from_estimated`` of poses (N, 3, 4) by their centres, and how it was found.
 
@@ -101,14 +124,17 @@ def fit_camera_similarity(estimated: FloatArray, reference: FloatArray) -> tuple
 
     rotation = nearest_rotation(pairs.correlation())
     alignment = "centres"
-    if min(width_est, width_ref) < _MIN_RELATIVE_WIDTH:
+    if min(width_est, width_ref) < MIN_RELATIVE_WIDTH:
         rotation = _roll_from_orientations(rotation, line_ref, estimated[:, :, :3], reference[:, :, :3])
         alignment = "centres, roll from orientations"
 
-    scale = pairs.least_squares_scale(rotation)
+    return pairs.similarity(rotation, _positive(pairs.least_squares_scale(rotation))), alignment
+
+
+def _positive(scale: float) -> float:
     if scale <= 0:
         raise DegenerateAlignmentError(f"the camera centres fit best at scale {scale:.2g}: they have nothing in common")
-    return pairs.similarity(rotation, scale), alignment
+    return scale
 
 
 def _spread(centred: FloatArray, mean: FloatArray, which: str) -> tuple[float, FloatArray]:

@@ -1,13 +1,13 @@
 """How far an estimated trajectory is from a reference one, by image name.
 
-Two trajectories are dictionaries from image name to ``world_from_cam`` (3, 4); the readers below
-make them from the files in which references come. ``compare_trajectories`` brings the estimate
+Two trajectories are dictionaries from image name to ``world_from_cam`` (3, 4), as readers in ``importers``
+make them of files. ``compare_trajectories`` brings the estimate
 into the reference's frame by one similarity transform and measures what is left.
 
 The similarity is the least-squares fit of the camera centres, each image counting the same, as
 other tools make it (evo, the TUM benchmark). Centres on a straight line leave the roll about that
 line free, and centres nearly on one leave it to the noise: then the roll, and nothing else, comes
-from the orientations. ``Evaluation.alignment`` says which of the two it was.
+from the orientations. ``Evaluation.alignment`` says which of the two it was. The module ``evaluate`` has all figures.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ import numpy as np
 
 from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.estimators.similarity import fit_camera_similarity
+from smust3r_colmap.evaluation.absolute_error import Statistics, position_errors, rotation_errors_deg
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import Sim3
-from smust3r_colmap.geometry.so3 import angles_between
 
 Trajectory = Mapping[str, FloatArray]
 
@@ -96,8 +96,8 @@ def compare_trajectories(
     reference = _stacked(world_from_cam_reference, names, "reference")
     reference_from_estimated, alignment = fit_camera_similarity(estimated, reference)
     moved = reference_from_estimated.move_cameras(estimated)
-    distances = np.linalg.norm(moved[:, :, 3] - reference[:, :, 3], axis=1)
-    angles_deg = np.rad2deg(angles_between(reference[:, :, :3], moved[:, :, :3]))
+    positions = Statistics.of(position_errors(moved, reference))
+    rotations_deg = Statistics.of(rotation_errors_deg(moved, reference))
     return Evaluation(
         reference_from_estimated=reference_from_estimated,
         alignment=alignment,
@@ -105,12 +105,12 @@ def compare_trajectories(
         num_reference=len(world_from_cam_reference),
         largest_gap_images=_largest_gap(world_from_cam_estimated, world_from_cam_reference),
         extent=float(np.linalg.norm(np.ptp(reference[:, :, 3], axis=0))),
-        position_rmse=float(np.sqrt(np.mean(distances**2))),
-        position_median=float(np.median(distances)),
-        position_max=float(distances.max()),
-        rotation_mean_deg=float(angles_deg.mean()),
-        rotation_median_deg=float(np.median(angles_deg)),
-        rotation_max_deg=float(angles_deg.max()),
+        position_rmse=positions.rmse,
+        position_median=positions.median,
+        position_max=positions.max,
+        rotation_mean_deg=rotations_deg.mean,
+        rotation_median_deg=rotations_deg.median,
+        rotation_max_deg=rotations_deg.max,
     )
 
 

@@ -20,7 +20,6 @@ import pycolmap
 from smust3r_colmap.colmap.database import write_colmap_database
 from smust3r_colmap.colmap.reconstruction import cameras_of, poses_of
 from smust3r_colmap.errors import DegenerateAlignmentError
-from smust3r_colmap.evaluation.readers import read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.execution.task_pool import TaskFailure, in_child
 from smust3r_colmap.features.guided_verification import (
@@ -33,6 +32,7 @@ from smust3r_colmap.features.guided_verification import (
 )
 from smust3r_colmap.geometry.arrays import FloatArray, Pair
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.importers.model_poses import read_model_poses
 from smust3r_colmap.refinement.acceptance import movement, report_of
 from smust3r_colmap.refinement.bundle_adjustment import Tolerance, triangulate
 from smust3r_colmap.refinement.mapper import FINE_TOLERANCE_FRACTION, MapperSession
@@ -168,7 +168,7 @@ def map_with_neighbours(session: MapperSession, wrong: Collection[int]) -> dict[
             return {}
         if not succeeded:
             return {}
-        mapped = read_reference_sparse(task.output)
+        mapped = read_model_poses(task.output)
     return _in_world(mapped, poses, wrong, [image.name for image in session.collection.images])
 
 

@@ -19,11 +19,11 @@ import numpy.typing as npt
 from PIL import Image, UnidentifiedImageError
 
 from smust3r_colmap.errors import CollectionError, ImageError, InputError
-from smust3r_colmap.evaluation.readers import read_poses_txt
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.importers.images import load_rgb
+from smust3r_colmap.importers.poses_txt import read_poses_txt
 from smust3r_colmap.products import ImageCollection, SourceImage
 from smust3r_colmap.storage.run_directory import key_of
 from smust3r_colmap.synthetic.room import DemoScene, demo_intrinsics

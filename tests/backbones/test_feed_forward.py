@@ -24,11 +24,12 @@ from smust3r_colmap.backbones.feed_forward import (
 )
 from smust3r_colmap.config import OutputConfig, RefinementConfig, RunConfig, SegmentationConfig
 from smust3r_colmap.errors import CheckpointError, ReconstructionError
-from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.execution.progress import QuietReporter, Stage
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import pointmap_from_depth
+from smust3r_colmap.importers.model_poses import read_model_poses
+from smust3r_colmap.importers.poses_txt import read_poses_txt
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.products import ImageCollection, Segment, SourceImage, UnregisteredImage
 from smust3r_colmap.report.summary import RunSummary
@@ -393,7 +394,7 @@ def test_a_whole_run_closes_its_loop_and_goes_on_for_nothing(room: Path, tmp_pat
     assert [one.kind for one in summary.segments] == ["window"] * 8 + ["loop"]
     assert [one.accepted for one in summary.loops] == [True]
     assert (tmp_path / "out" / "work" / "segments" / "0008" / "room" / "maps.safetensors").is_file()
-    model = read_reference_sparse(tmp_path / "out" / "sparse" / "0")
+    model = read_model_poses(tmp_path / "out" / "sparse" / "0")
     assert len(model) == ROOM_IMAGES
     assert compare_trajectories(model, read_poses_txt(room / "poses.txt")).position_rmse_percent < 0.05
     again = run(room, tmp_path / "out")
@@ -407,4 +408,4 @@ def test_doubts_make_a_run_weak_and_leave_its_model(room: Path, tmp_path: Path) 
     assert summary.weak_reasons == (
         "the geometry of 9 of 9 segments should not be trusted, such as segment 0: all is fog",
     )
-    assert len(read_reference_sparse(tmp_path / "out" / "sparse" / "0")) == ROOM_IMAGES
+    assert len(read_model_poses(tmp_path / "out" / "sparse" / "0")) == ROOM_IMAGES

@@ -27,9 +27,10 @@ from smust3r_colmap.backbones.registry import (
 )
 from smust3r_colmap.config import OutputConfig, RunConfig, SegmentationConfig
 from smust3r_colmap.errors import CheckpointError, ConfigError, MissingDependencyError
-from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.execution.progress import QuietReporter
+from smust3r_colmap.importers.model_poses import read_model_poses
+from smust3r_colmap.importers.poses_txt import read_poses_txt
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.products import ImageCollection
 from smust3r_colmap.storage.run_directory import RunDirectory
@@ -286,7 +287,7 @@ def test_the_example_of_the_page_reconstructs_the_demo(mynet: Path, tmp_path: Pa
     assert summary.num_registered == NUM_IMAGES
     assert not summary.metric
     found = compare_trajectories(
-        read_reference_sparse(tmp_path / "out" / "sparse" / "0"), read_poses_txt(tmp_path / "room" / "poses.txt")
+        read_model_poses(tmp_path / "out" / "sparse" / "0"), read_poses_txt(tmp_path / "room" / "poses.txt")
     )
     # The plug-in is exact; adjusting to features of images of 160 x 120 pixels costs it a little.
     assert found.position_rmse_percent < 0.15

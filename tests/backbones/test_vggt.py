@@ -28,11 +28,11 @@ from smust3r_colmap.backbones.registry import make_backbone
 from smust3r_colmap.backbones.vggt import Crop, Device, VggtPredictor
 from smust3r_colmap.config import LoopConfig, OutputConfig, RefinementConfig, RunConfig, SegmentationConfig
 from smust3r_colmap.errors import CheckpointError, ConfigError, MissingDependencyError, ReconstructionError
-from smust3r_colmap.evaluation.readers import read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.execution.progress import QuietReporter
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.images import load_rgb
+from smust3r_colmap.importers.model_poses import read_model_poses
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.products import ImageCollection, Segment, SourceImage
 from smust3r_colmap.segmentation.view_graph import ViewGraph
@@ -308,7 +308,7 @@ def test_a_whole_run_gives_the_true_trajectory(room: Room, checkpoint: Path, tmp
     assert (summary.exit_code, summary.weak_reasons, summary.metric) == (0, (), False)
     assert summary.segments[0].method == "VGGT at 140 px, 6 images at once"
     truth = {f"{k:02d}.png": pose for k, pose in enumerate(room.world_from_cam)}
-    found = compare_trajectories(read_reference_sparse(tmp_path / "out" / "sparse" / "0"), truth)
+    found = compare_trajectories(read_model_poses(tmp_path / "out" / "sparse" / "0"), truth)
     assert found.num_compared == NUM_IMAGES
     assert found.position_rmse_percent < 0.05
 

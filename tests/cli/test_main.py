@@ -37,7 +37,6 @@ from smust3r_colmap.config import (
     RunConfig,
 )
 from smust3r_colmap.errors import CollectionError, ReconstructionError, advice_for
-from smust3r_colmap.evaluation.readers import read_poses_txt
 from smust3r_colmap.execution.progress import (
     PlainReporter,
     QuietReporter,
@@ -47,6 +46,7 @@ from smust3r_colmap.execution.progress import (
     reporter_for,
 )
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.importers.poses_txt import read_poses_txt
 from smust3r_colmap.refinement.statistics import SceneRefinement
 from smust3r_colmap.report.summary import (
     ImageNote,
@@ -193,7 +193,7 @@ def test_an_unknown_command_exits_2_with_those_there_are(
     assert cli.main([typed, "photos"]) == 2
     assert capsys.readouterr().err == (
         f"smust3r-colmap: there is no command {typed!r}{meant}; "
-        "the commands are reconstruct, refine, frames, export, validate, demo, doctor, weights\n"
+        "the commands are reconstruct, refine, frames, export, validate, evaluate, demo, doctor, weights\n"
     )
 
 

@@ -21,7 +21,6 @@ from smust3r_colmap.cli.refine import Refine
 from smust3r_colmap.config import FeatureConfig, ModelCameraConfig, ModelOutputConfig, RefineConfig, TrackConfig
 from smust3r_colmap.dense.external_points import refined_from_start
 from smust3r_colmap.errors import ConfigError, InputError
-from smust3r_colmap.evaluation.readers import read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import Evaluation, compare_trajectories
 from smust3r_colmap.execution.progress import QuietReporter
 from smust3r_colmap.features.pairs import alike_pairs, neighbouring_pairs
@@ -29,6 +28,7 @@ from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import pointmap_from_depth
 from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
 from smust3r_colmap.geometry.world_frame import WorldFrame
+from smust3r_colmap.importers.model_poses import read_model_poses
 from smust3r_colmap.products import EMPTY_CLOUD, Scene
 from smust3r_colmap.refine_model import refine_model
 from smust3r_colmap.report.summary import RunSummary
@@ -66,7 +66,7 @@ class Export:
         return self.root / "export"
 
     def error_of(self, model: Path) -> Evaluation:
-        return compare_trajectories(read_reference_sparse(model), self.truth)
+        return compare_trajectories(read_model_poses(model), self.truth)
 
 
 def disturbed(world_from_cam: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -227,7 +227,7 @@ def test_images_that_the_model_lacks_are_placed_when_that_is_wanted(export: Expo
     model = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
     assert model.num_cameras() == 1
     assert [model.image(i).name for i in sorted(model.images)][-2:] == list(LACKING)
-    found = compare_trajectories(read_reference_sparse(tmp_path / "out/sparse/0"), export.truth)
+    found = compare_trajectories(read_model_poses(tmp_path / "out/sparse/0"), export.truth)
     assert found.num_compared == NUM_IMAGES
     assert 0 < found.position_max < 0.03
 
@@ -290,7 +290,7 @@ def test_photographs_without_a_feature_leave_the_model_as_it_was(export: Export,
     ]
     assert any("has no tracks" in reason for reason in summary.weak_reasons)
     assert any("5 of 9 files could not be used" in reason for reason in summary.weak_reasons)
-    found = compare_trajectories(read_reference_sparse(tmp_path / "out/sparse/0"), export.start)
+    found = compare_trajectories(read_model_poses(tmp_path / "out/sparse/0"), export.start)
     assert found.num_compared == 3
     assert found.position_max < 1e-6
     assert (tmp_path / "out/sparse/0/images.txt").exists()

@@ -21,9 +21,10 @@ from smust3r_colmap.config import (
     RunConfig,
     SegmentationConfig,
 )
-from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import Evaluation, compare_trajectories
 from smust3r_colmap.execution.progress import QuietReporter
+from smust3r_colmap.importers.model_poses import read_model_poses
+from smust3r_colmap.importers.poses_txt import read_poses_txt
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.report.summary import RunSummary
 
@@ -45,7 +46,7 @@ def run(folder: Path, names: list[str], work: Path, config: RunConfig = CONFIG) 
     for name in names:
         shutil.copy(folder / "images" / name, images)
     summary = reconstruct(images, work / "out", config, reporter=QuietReporter(sys.stderr))
-    estimated = read_reference_sparse(summary.output / "sparse/0")
+    estimated = read_model_poses(summary.output / "sparse/0")
     return summary, compare_trajectories(estimated, read_poses_txt(folder / "poses.txt"))
 
 

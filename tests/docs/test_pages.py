@@ -31,7 +31,7 @@ FLAGS_OF_OTHERS = {
 SHELL_WORDS = {"pip", "python", "colmap", "mkdir"}
 """Commands of other programs that pages show; those of COLMAP are run as Python beside them."""
 
-RUN_HERE = ("export", "validate", "weights list")
+RUN_HERE = ("export", "validate", "evaluate", "weights list")
 """How commands begin that take a second; `doctor` has tests of its own, the others take minutes, or weights."""
 
 
@@ -74,7 +74,7 @@ def test_every_command_parses(page: str, command: str) -> None:
 
 def test_the_main_commands_are_shown() -> None:
     shown = {command.split()[0] for _, command in COMMANDS}
-    assert {"reconstruct", "refine", "export", "validate", "demo", "doctor", "weights"} <= shown
+    assert {"reconstruct", "refine", "export", "validate", "evaluate", "demo", "doctor", "weights"} <= shown
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,8 @@ def finished(finished_example: Example, tmp_path_factory: pytest.TempPathFactory
     (folder / "demo_out").mkdir()
     shutil.copytree(finished_example.root, folder / "demo_out/result")
     shutil.copytree(finished_example.images, folder / "path/to/images")
-    shutil.copytree(finished_example.root / "sparse/0", folder / "path/to/model")
+    for name in ("model", "truth"):
+        shutil.copytree(finished_example.root / "sparse/0", folder / "path/to" / name)
     for image in (folder / "path/to/images").rglob("*.png"):
         mask = folder / "path/to/masks" / image.relative_to(folder / "path/to/images")
         mask.parent.mkdir(parents=True, exist_ok=True)

@@ -1,18 +1,14 @@
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from smust3r_colmap.errors import DegenerateAlignmentError, InputError
-from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse, read_transforms_json
+from smust3r_colmap.errors import DegenerateAlignmentError
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.geometry.arrays import FloatArray
-from smust3r_colmap.geometry.sim3 import Sim3, invert_rigid
+from smust3r_colmap.geometry.sim3 import Sim3
 
 # Two made-up walks round a block: x, y, z, then yaw, pitch and roll in degrees (intrinsic z, y, x).
 REFERENCE = np.array(
@@ -200,82 +196,3 @@ def test_poses_that_are_not_rigid_are_refused(pose: FloatArray, message: str) ->
     reference = trajectory(REFERENCE)
     with pytest.raises(ValueError, match=message):
         compare_trajectories({**reference, "3.jpg": pose}, reference)
-
-
-# ---------------------------------------------------------------------------- readers
-def test_poses_txt_is_camera_to_world_with_the_real_part_first(tmp_path: Path) -> None:
-    path = tmp_path / "poses.txt"
-    # A quarter turn about z: the camera's x axis is the world's y axis.
-    path.write_text("# image qw qx qy qz tx ty tz\n\na/1.jpg 0.7071067812 0 0 0.7071067812 1 2 3\n")
-    poses = read_poses_txt(path)
-    assert list(poses) == ["a/1.jpg"]
-    np.testing.assert_allclose(poses["a/1.jpg"], [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]], atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("a.jpg 1 0 0 0 1 2", "line 2: 6 numbers after the name"),
-        ("a.jpg 1 0 0 0 1 2 3 4", "line 2: 8 numbers after the name"),
-        ("a.jpg 1 0 0 zero 1 2 3", "line 2: could not convert string to float: 'zero'"),
-        ("a.jpg 1 0 0 0 1 2 nan", "line 2: .* all finite"),
-        ("a.jpg 1 1 0 0 1 2 3", "line 2: the quaternion has length 1.414"),
-        ("a.jpg 1 0 0 0 1 2 3\na.jpg 1 0 0 0 1 2 3", "line 3: a.jpg has a pose already"),
-    ],
-)
-def test_broken_poses_txt_is_refused_with_its_line(tmp_path: Path, line: str, message: str) -> None:
-    path = tmp_path / "poses.txt"
-    path.write_text(f"# image qw qx qy qz tx ty tz\n{line}\n")
-    with pytest.raises(InputError, match=message):
-        read_poses_txt(path)
-    with pytest.raises(InputError, match=r"absent.txt: cannot be read"):
-        read_poses_txt(tmp_path / "absent.txt")
-
-
-def test_reference_sparse_inverts_colmaps_poses_and_keeps_names(tmp_path: Path) -> None:
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(camera_id=1, model="PINHOLE", width=4, height=4, params=[4.0, 4.0, 2.0, 2.0])
-    )
-    poses = trajectory(REFERENCE)
-    for k, (name, pose) in enumerate(poses.items(), start=1):
-        image = pycolmap.Image(name=f"left/{name}", camera_id=1, image_id=k)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(invert_rigid(pose)))
-    model.write_text(tmp_path)
-    read = read_reference_sparse(tmp_path)
-    assert sorted(read) == sorted(f"left/{name}" for name in poses)
-    for name, pose in poses.items():
-        np.testing.assert_allclose(read[f"left/{name}"], pose, atol=1e-12)
-
-
-def test_a_folder_without_a_model_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="not a COLMAP model"):
-        read_reference_sparse(tmp_path)
-
-
-def test_transforms_json_is_turned_to_opencv_axes(tmp_path: Path) -> None:
-    path = tmp_path / "transforms.json"
-    # An OpenGL camera looks along -z with y up; as OpenCV it looks along the world's -z, its y axis down.
-    matrix = [[1, 0, 0, 7], [0, 1, 0, 8], [0, 0, 1, 9], [0, 0, 0, 1]]
-    frames = [{"file_path": name, "transform_matrix": matrix} for name in ("images/1.jpg", "./images/a/2.jpg", "3.jpg")]
-    path.write_text(json.dumps({"fl_x": 1.0, "frames": frames}))
-    poses = read_transforms_json(path)
-    assert list(poses) == ["1.jpg", "a/2.jpg", "3.jpg"]
-    np.testing.assert_array_equal(poses["a/2.jpg"], [[1, 0, 0, 7], [0, -1, 0, 8], [0, 0, -1, 9]])
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("{", "not a transforms.json: JSONDecodeError"),
-        ("{}", "not a transforms.json: KeyError 'frames'"),
-        ('{"frames": [{"file_path": "1.jpg"}]}', "not a transforms.json: KeyError 'transform_matrix'"),
-        ('{"frames": [{"file_path": "1.jpg", "transform_matrix": "no"}]}', "1.jpg: transform_matrix is not numbers"),
-        ('{"frames": [{"file_path": "1.jpg", "transform_matrix": [[1]]}]}', "1.jpg: .* not a rigid 4 x 4 matrix"),
-    ],
-)
-def test_broken_transforms_json_is_refused(tmp_path: Path, content: str, message: str) -> None:
-    path = tmp_path / "transforms.json"
-    path.write_text(content)
-    with pytest.raises(InputError, match=message):
-        read_transforms_json(path)

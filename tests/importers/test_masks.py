@@ -31,7 +31,6 @@ from smust3r_colmap.config import (
     RunConfig,
 )
 from smust3r_colmap.errors import ConfigError, ImageError, InputError, RunDirectoryError
-from smust3r_colmap.evaluation.readers import read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.execution.progress import QuietReporter
 from smust3r_colmap.execution.task_pool import TaskPool
@@ -41,6 +40,7 @@ from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.image_folder import import_image_folder
 from smust3r_colmap.importers.masks import left_out_shares, load_mask, names_without_mask, with_alpha, with_masks
+from smust3r_colmap.importers.model_poses import read_model_poses
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.products import ImageCollection, ImageMask, SourceImage
 from smust3r_colmap.refine_model import refine_model
@@ -390,7 +390,7 @@ def test_a_masked_run_finds_the_cameras_and_names_images_without_a_mask(
     drive: Drive, masked_run: tuple[Path, str]
 ) -> None:
     output, warnings = masked_run
-    found = compare_trajectories(read_reference_sparse(output / "sparse/0"), drive.truth)
+    found = compare_trajectories(read_model_poses(output / "sparse/0"), drive.truth)
     assert found.num_compared == NUM_IMAGES
     assert 0 < found.position_rmse < 0.01
     assert "1 of 8 images have no mask and are used as a whole, such as 007.png" in warnings

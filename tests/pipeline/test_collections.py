@@ -20,9 +20,10 @@ from smust3r_colmap.config import (
     RunConfig,
     SegmentationConfig,
 )
-from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.execution.progress import QuietReporter
+from smust3r_colmap.importers.model_poses import read_model_poses
+from smust3r_colmap.importers.poses_txt import read_poses_txt
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.report.summary import RunSummary
 from smust3r_colmap.storage.config_file import config_to_toml
@@ -92,7 +93,7 @@ def test_images_in_no_order_give_the_model_of_the_walk(
     assert len(finished.segments) > 2
     assert finished.order.startswith("images in no order")
     assert [model.num_images for model in finished.models] == [NUM_IMAGES]
-    found = {old_names[name]: pose for name, pose in read_reference_sparse(finished.output / "sparse/0").items()}
+    found = {old_names[name]: pose for name, pose in read_model_poses(finished.output / "sparse/0").items()}
     assert 0 < compare_trajectories(found, read_poses_txt(room / "poses.txt")).position_rmse < 0.02
     again = {stage.name: stage.reused for stage in run(images, finished.output).stages}
     assert all(again[name] for name in ("look-alikes", "cover", "mapping", "alignment", "refinement"))
@@ -133,7 +134,7 @@ def test_frames_between_keyframes_get_pose_and_depth(room: Path, tmp_path: Path)
     assert summary.num_keyframes == 3 * NUM_IMAGES // 4
     assert (summary.num_registered, len(summary.models), summary.exit_code) == (NUM_IMAGES, 1, 0)
     truth = read_poses_txt(room / "poses.txt")
-    distance = compare_trajectories(read_reference_sparse(tmp_path / "out/sparse/0"), truth)
+    distance = compare_trajectories(read_model_poses(tmp_path / "out/sparse/0"), truth)
     assert 0 < distance.position_rmse < 0.02
     maps = depth_maps_of_run(tmp_path / "out/work")
     covered = [float((maps.depth(name) > 0).mean()) for name in truth]

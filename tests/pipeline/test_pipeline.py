@@ -35,10 +35,11 @@ from smust3r_colmap.config import (
     TransformGroup,
 )
 from smust3r_colmap.errors import CollectionError, ConfigError, InputError, ReconstructionError
-from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.execution.progress import QuietReporter
 from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.importers.model_poses import read_model_poses
+from smust3r_colmap.importers.poses_txt import read_poses_txt
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.report.summary import RunSummary
 from smust3r_colmap.storage.config_file import config_to_toml
@@ -116,9 +117,7 @@ def test_every_image_is_placed_within_centimetres_of_the_truth(finished: RunSumm
     assert finished.num_registered == NUM_IMAGES
     assert finished.exit_code == 0
     assert len(finished.models) == 1
-    found = compare_trajectories(
-        read_reference_sparse(finished.output / "sparse/0"), read_poses_txt(room / "poses.txt")
-    )
+    found = compare_trajectories(read_model_poses(finished.output / "sparse/0"), read_poses_txt(room / "poses.txt"))
     assert found.num_compared == NUM_IMAGES
     assert 0 < found.position_rmse < 0.03
     assert 0 < found.rotation_median_deg < 1.0
@@ -138,7 +137,7 @@ def test_a_known_calibration_is_kept_to_the_last_digit(room: Path, brief_walk: P
     summary = run(brief_walk, tmp_path / "out", replace(BRIEF, cameras=known, loop_closing=NO_LOOPS))
     (camera,) = pycolmap.Reconstruction(tmp_path / "out/sparse/0").cameras.values()
     assert (camera.model.name, [*camera.params]) == ("PINHOLE", [float(value) for value in params])
-    poses = read_reference_sparse(tmp_path / "out/sparse/0")
+    poses = read_model_poses(tmp_path / "out/sparse/0")
     assert summary.num_registered == NUM_BRIEF
     assert compare_trajectories(poses, read_poses_txt(room / "poses.txt")).position_rmse < 0.02
 
@@ -154,7 +153,7 @@ def test_the_model_is_read_by_an_independent_reader(finished: RunSummary) -> Non
 
 def test_the_cloud_lies_inside_the_room_and_on_its_walls(finished: RunSummary, room: Path) -> None:
     """The room spans x -3..3, y -2..2, z 0..3 m; the cameras look level, so floor and ceiling are hardly seen."""
-    estimated, truth = read_reference_sparse(finished.output / "sparse/0"), read_poses_txt(room / "poses.txt")
+    estimated, truth = read_model_poses(finished.output / "sparse/0"), read_poses_txt(room / "poses.txt")
     fit = compare_trajectories(estimated, truth).reference_from_estimated
     cloud = trimesh.load(finished.output / "points.ply", process=False)
     assert isinstance(cloud, trimesh.PointCloud)
@@ -449,7 +448,7 @@ def test_a_walk_that_comes_back_is_closed_and_a_run_without_loops_is_not(
     assert sum(candidate["taken"] for candidate in plan["candidates"]) == len(summary.loops)
     assert all(candidate["reason"] for candidate in plan["candidates"])
     truth = read_poses_txt(round_trip / "poses.txt")
-    found = compare_trajectories(read_reference_sparse(tmp_path / "out/sparse/0"), truth)
+    found = compare_trajectories(read_model_poses(tmp_path / "out/sparse/0"), truth)
     assert found.num_compared == summary.num_registered == NUM_ROUND
     assert found.position_rmse < 0.02
     before = np.loadtxt(tmp_path / "out/trajectory_without_loops_tum.txt")
@@ -506,6 +505,6 @@ def test_groups_that_bend_still_place_every_camera(
     bending = replace(UNREFINED, alignment=AlignmentConfig(transform_group=group))
     summary = run(room / "images", tmp_path / "out", bending)
     assert all(was_reused for name, was_reused in reused(summary).items() if name in {"features", "mapping", "depth"})
-    found = compare_trajectories(read_reference_sparse(tmp_path / "out/sparse/0"), read_poses_txt(room / "poses.txt"))
+    found = compare_trajectories(read_model_poses(tmp_path / "out/sparse/0"), read_poses_txt(room / "poses.txt"))
     assert found.num_compared == NUM_IMAGES
     assert found.position_rmse < 0.05

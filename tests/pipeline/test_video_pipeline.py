@@ -18,10 +18,11 @@ from smust3r_colmap.config import (
     RunConfig,
     VideoConfig,
 )
-from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.execution.progress import QuietReporter
 from smust3r_colmap.exporters.finished_run import open_finished
+from smust3r_colmap.importers.model_poses import read_model_poses
+from smust3r_colmap.importers.poses_txt import read_poses_txt
 from smust3r_colmap.pipeline import reconstruct
 from smust3r_colmap.report.summary import RunSummary
 from smust3r_colmap.storage.config_file import config_to_toml
@@ -57,7 +58,7 @@ def finished(room: Path) -> RunSummary:
 
 def test_the_video_is_reconstructed_as_its_images_would_be(finished: RunSummary, room: Path) -> None:
     assert (finished.num_images, finished.num_registered, len(finished.models)) == (NUM_SHOWN, NUM_SHOWN, 1)
-    estimated = read_reference_sparse(finished.output / "sparse/0")
+    estimated = read_model_poses(finished.output / "sparse/0")
     names = [f"walk/{k / RATE:010.3f}.jpg" for k in range(NUM_SHOWN)]
     assert sorted(estimated) == names
     truth = list(read_poses_txt(room / "poses.txt").values())[:NUM_SHOWN]

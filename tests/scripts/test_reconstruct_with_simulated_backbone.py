@@ -12,9 +12,10 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.errors import InputError
-from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.geometry.camera import pixel_centres
+from smust3r_colmap.importers.model_poses import read_model_poses
+from smust3r_colmap.importers.poses_txt import read_poses_txt
 
 NAMES = ("a.jpg", "b.jpg")
 SLOPE = 0.8
@@ -151,7 +152,7 @@ def test_the_kitchen_without_errors_comes_out_in_metres(
     assert "6 of 6 images have a pose. Scale: metres." in capsys.readouterr().out
     config = (output / "config.toml").read_text()
     assert 'backbone = "simulated"' in config and 'backbone_options = "preset=perfect"' in config
-    found = compare_trajectories(read_reference_sparse(output / "sparse/0"), read_poses_txt(data / "poses.txt"))
+    found = compare_trajectories(read_model_poses(output / "sparse/0"), read_poses_txt(data / "poses.txt"))
     assert found.num_compared == 6
     assert found.reference_from_estimated.scale == pytest.approx(1, abs=0.05)
     assert 0 < found.position_rmse < 0.02

@@ -11,11 +11,12 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.errors import ConfigError, StorageError
-from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres, pointmap_from_depth
 from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.importers.model_poses import read_model_poses
+from smust3r_colmap.importers.poses_txt import read_poses_txt
 from smust3r_colmap.synthetic.room import _BOXES, DemoScene, demo_intrinsics, write_demo
 
 SMALL = demo_intrinsics(160, 120)
@@ -193,7 +194,7 @@ def test_colmap_recovers_the_cameras(scene: DemoScene, tmp_path: Path) -> None:
     for name, pose in truth.items():
         Image.fromarray(scene.render(pose, intrinsics)[0]).save(tmp_path / "images" / name)
     _map_with_colmap(tmp_path, intrinsics)
-    result = compare_trajectories(read_reference_sparse(tmp_path / "sparse" / "0"), truth)
+    result = compare_trajectories(read_model_poses(tmp_path / "sparse" / "0"), truth)
     assert result.num_compared == 8
     assert 1e-5 < result.position_rmse < 0.01
     assert 1e-4 < result.rotation_max_deg < 1

@@ -18,8 +18,9 @@ import pytest
 import trimesh
 
 from smust3r_colmap.cli.main import main
-from smust3r_colmap.evaluation.readers import read_poses_txt, read_reference_sparse
 from smust3r_colmap.evaluation.trajectory import Evaluation, compare_trajectories
+from smust3r_colmap.importers.model_poses import read_model_poses
+from smust3r_colmap.importers.poses_txt import read_poses_txt
 from smust3r_colmap.synthetic.room import write_demo
 
 pytestmark = pytest.mark.slow
@@ -53,7 +54,7 @@ def summary(finished: tuple[Path, int]) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def found(finished: tuple[Path, int], room: Path) -> Evaluation:
-    return compare_trajectories(read_reference_sparse(finished[0] / "sparse/0"), read_poses_txt(room / "poses.txt"))
+    return compare_trajectories(read_model_poses(finished[0] / "sparse/0"), read_poses_txt(room / "poses.txt"))
 
 
 def test_the_network_places_every_image_and_nothing_is_doubted(
