@@ -13,6 +13,7 @@ import numpy as np
 
 from smust3r_colmap.errors import InputError
 from smust3r_colmap.geometry.arrays import FloatArray, IntArray
+from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.importers.pose_set import (
     DepthFiles,
     PoseSet,
@@ -25,6 +26,9 @@ from smust3r_colmap.importers.pose_set import (
 _NEEDED = "timestamp tx ty tz qx qy qz qw"
 _DEPTH_PER_METRE = 5000.0
 """Of both benchmarks."""
+_KINECT = Intrinsics(model="PINHOLE", width=640, height=480, params=(525.0, 525.0, 320.0, 240.0))
+"""The page of TUM RGB-D advises this calibration for depth, which is registered to the colour images. Its principal
+point (319.5, 239.5) has the centre of the first pixel at (0, 0)."""
 _DEPTH_WITHIN_S = 0.02
 """An image has the depth that was measured at most so long before or after, as in TUM's own ``associate.py``."""
 _MAX_FRAME_NUMBER = 1e7
@@ -52,7 +56,6 @@ def read_tum(path: Path) -> PoseSet:
         ),
         stamps_s=stamps_s,
         numbers=_as_frame_numbers(stamps_s),
-        unit="m",
     )
 
 
@@ -64,13 +67,14 @@ def read_tum_folder(folder: Path) -> PoseSet:
     """
     truth = read_tum(folder / "groundtruth.txt")
     images, depth = _listed(folder / "rgb.txt"), _listed(folder / "depth.txt")
+    is_eth3d = (folder / "calibration.txt").is_file()
     return PoseSet(
-        layout="ETH3D-SLAM" if (folder / "calibration.txt").is_file() else "TUM RGB-D",
+        layout="ETH3D-SLAM" if is_eth3d else "TUM RGB-D",
         place=truth.place,
         world_from_cam=truth.world_from_cam,
         stamps_s=truth.stamps_s,
         image_stamps=images,
-        depth=_depth_of(folder, images, depth) if images and depth else None,
+        depth=_depth_of(folder, images, depth, None if is_eth3d else _KINECT) if images and depth else None,
         unit="m",
     )
 
@@ -100,7 +104,9 @@ def _listed(path: Path) -> dict[str, float]:
     return listed
 
 
-def _depth_of(folder: Path, images: dict[str, float], depth: dict[str, float]) -> DepthFiles:
+def _depth_of(
+    folder: Path, images: dict[str, float], depth: dict[str, float], intrinsics: Intrinsics | None
+) -> DepthFiles:
     names, stamps_s = list(depth), np.array(list(depth.values()))
     nearest = {name: int(np.argmin(np.abs(stamps_s - stamp_s))) for name, stamp_s in images.items()}
     return DepthFiles(
@@ -108,5 +114,5 @@ def _depth_of(folder: Path, images: dict[str, float], depth: dict[str, float]) -
             name: folder / names[k] for name, k in nearest.items() if abs(stamps_s[k] - images[name]) <= _DEPTH_WITHIN_S
         },
         per_unit=_DEPTH_PER_METRE,
-        intrinsics=None,
+        intrinsics=intrinsics,
     )

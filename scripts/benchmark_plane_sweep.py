@@ -23,6 +23,7 @@ import numpy as np
 import pycolmap
 
 from smust3r_colmap.backbones.classical.plane_sweep import ImageDepth, reconstruct_depth
+from smust3r_colmap.evaluation.depth_error import KINECT_COLOUR_FROM_SENSOR
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 from smust3r_colmap.products import Tracks
@@ -33,14 +34,6 @@ CONFIDENCE_CUTS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
 
 SENSOR_FOCAL_PX = 585.0  # of the 640x480 depth images, as shipped with the set
 COLOUR_FOCAL_PX = 525.0  # where the mapper starts
-# Kinect's nominal calibration as commonly used with 7-Scenes: the colour camera sits 26 mm to the side.
-COLOUR_FROM_SENSOR = np.array(
-    [
-        [0.99996518, 0.00267651, -0.00790410, -0.02555894],
-        [-0.00274093, 0.99996303, -0.00815045, 0.00010110],
-        [0.00788199, 0.00817183, 0.99993555, 0.00203183],
-    ]
-)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -123,7 +116,7 @@ def sensor_depth(stretch: Stretch, k: int, width: int, height: int) -> FloatArra
     xy = pixel_centres(640, 480) - (320.0, 240.0)
     points_sensor = np.column_stack([xy / SENSOR_FOCAL_PX, np.ones(len(xy))]) * sensor.reshape(-1, 1)
     points_sensor = points_sensor[(sensor.ravel() > 0) & (sensor.ravel() < 8.0)]  # beyond 8 m: no reading
-    points = points_sensor @ COLOUR_FROM_SENSOR[:, :3].T + COLOUR_FROM_SENSOR[:, 3]
+    points = points_sensor @ KINECT_COLOUR_FROM_SENSOR[:, :3].T + KINECT_COLOUR_FROM_SENSOR[:, 3]
     columns, rows = np.floor(stretch.intrinsics[k].resized(width, height).xy_img(points)).astype(int).T
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     depth = np.full((height, width), np.inf)

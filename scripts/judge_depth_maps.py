@@ -24,25 +24,19 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
-from benchmark_plane_sweep import COLOUR_FROM_SENSOR
 
+from smust3r_colmap.config import DepthRegistration
 from smust3r_colmap.errors import InputError, SmustrError
+from smust3r_colmap.evaluation.depth_error import VIEW_FROM_SENSOR, DepthErrors, depth_in_view, map_ratios
 from smust3r_colmap.evaluation.trajectory import compare_trajectories
-from smust3r_colmap.geometry.arrays import FloatArray
-from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
+from smust3r_colmap.geometry.arrays import Float32Array, FloatArray
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.importers.model_poses import read_model_poses
 from smust3r_colmap.importers.poses_txt import read_poses_txt
-from smust3r_colmap.synthetic.truth import TrueScene, z_buffer
+from smust3r_colmap.importers.workspace_depth import DenseWorkspace
+from smust3r_colmap.synthetic.truth import TrueScene
 
-FloatMap = npt.NDArray[np.float32]
-
-REGISTRATIONS = {"kinect": COLOUR_FROM_SENSOR, "none": np.eye(3, 4)}
-"""``view_from_sensor``: the nominal Kinect's, or the colour camera is where the sensor is and looks the same way."""
-READINGS_PER_PIXEL = 1.5
-"""Along each axis, at least: fewer would leave holes in a surface, through which the one behind it is seen."""
 NO_LIMIT_PX = 1 << 20
 """The sensor's maps are taken at their own size."""
 
@@ -67,28 +61,6 @@ class Comparison:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Figures:
-    """How good depth is; NaN where nothing could be compared.
-
-    Args:
-        what: an image, or what all of them are taken for.
-        num_compared: pixels, or points.
-        abs_rel: mean of abs(d - t) / t, with t the sensor's depth and d ours.
-        median_rel: median of the same.
-        delta_105, delta_125: share with max(d / t, t / d) below 1.05 and 1.25.
-        coverage: share of the pixels with a reading that have depth of ours, too; NaN for points.
-    """
-
-    what: str
-    num_compared: int
-    abs_rel: float
-    median_rel: float
-    delta_105: float
-    delta_125: float
-    coverage: float
-
-
-@dataclass(frozen=True, kw_only=True)
 class Judgement:
     """All figures of one run.
 
@@ -103,11 +75,11 @@ class Judgement:
     registration: str
     scale_of_depth: float
     scale_of_cameras: float
-    overall: Figures
-    at_scale_of_cameras: Figures
-    points: Figures
+    overall: DepthErrors
+    at_scale_of_cameras: DepthErrors
+    points: DepthErrors
     num_behind: int
-    images: tuple[Figures, ...]
+    images: tuple[DepthErrors, ...]
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -131,7 +103,7 @@ def parse_arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("data", type=Path, help="data set with depth/, poses.txt and intrinsics.txt of the sensor")
     parser.add_argument(
         "--registration",
-        choices=sorted(REGISTRATIONS),
+        choices=sorted(VIEW_FROM_SENSOR),
         default="kinect",
         help="where the colour camera is, seen from the sensor (%(default)s)",
     )
@@ -139,68 +111,31 @@ def parse_arguments(words: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(words)
 
 
-def judge(run: Path, data: Path, *, registration: str) -> Judgement:
+def judge(run: Path, data: Path, *, registration: DepthRegistration) -> Judgement:
     """Compare a run with the sensor.
 
     Raises:
         InputError: the run has no dense workspace, none of its images has a reading, or a file is not as it should be.
         DegenerateAlignmentError: fewer than three images have a pose in both, or the sensor stood still.
     """
-    workspace = run / "dense"
-    model = read_workspace(workspace)
-    view_from_sensor = REGISTRATIONS[registration]
-    comparisons = tuple(compare(workspace, model, data, view_from_sensor))
+    workspace = DenseWorkspace.open(run / "dense")
+    view_from_sensor = VIEW_FROM_SENSOR[registration]
+    comparisons = tuple(compare(workspace, data, view_from_sensor))
     scale = scale_of_depth(comparisons)
-    scale_of_cameras = similarity_scale(workspace / "sparse", data, view_from_sensor)
+    scale_of_cameras = similarity_scale(workspace.folder / "sparse", data, view_from_sensor)
     return Judgement(
         registration=registration,
         scale_of_depth=scale,
         scale_of_cameras=scale_of_cameras,
         overall=pooled("all images", comparisons, scale),
         at_scale_of_cameras=pooled("at the cameras' scale", comparisons, scale_of_cameras),
-        points=figures("sparse points", np.concatenate([one.point_ratios for one in comparisons]) * scale, None),
+        points=DepthErrors.of("sparse points", np.concatenate([one.point_ratios for one in comparisons]) * scale, None),
         num_behind=sum(one.num_behind for one in comparisons),
         images=tuple(pooled(one.name, [one], scale) for one in comparisons),
     )
 
 
 # ------------------------------------------------------------------------------ reading
-def read_workspace(workspace: Path) -> pycolmap.Reconstruction:
-    """The undistorted model of a dense workspace.
-
-    Raises:
-        InputError: there is none.
-    """
-    try:
-        return pycolmap.Reconstruction(workspace / "sparse")
-    except (ValueError, RuntimeError, OSError) as error:
-        raise InputError(
-            f"{workspace}: no dense workspace; write it with smust3r-colmap export {workspace.parent} --format dense"
-        ) from error
-
-
-def read_depth_map(path: Path, camera: Intrinsics) -> FloatMap | None:
-    """(H, W) z-depth in the unit of the model, 0 for none; None where the image has no map.
-
-    Raises:
-        InputError: the map is cut short, or of another size than the camera.
-    """
-    if not path.is_file():
-        return None
-    with path.open("rb") as file:
-        size = file.read(64).split(b"&")[:3]
-    if size != [str(number).encode() for number in (camera.width, camera.height, 1)]:
-        found = b" x ".join(size[:2]).decode(errors="replace")
-        raise InputError(f"{path}: is a map of {found} pixels, its camera has {camera.width} x {camera.height}")
-    needed = sum(len(number) + 1 for number in size) + 4 * camera.width * camera.height
-    if path.stat().st_size != needed:
-        raise InputError(f"{path}: {path.stat().st_size} bytes, needed {needed}; write the workspace again")
-    stored = pycolmap.DepthMap()
-    stored.read(path)
-    depth: FloatMap = stored.to_array()
-    return depth
-
-
 def similarity_scale(sparse: Path, data: Path, view_from_sensor: FloatArray) -> float:
     """Metres per unit of the model, from the places of the cameras."""
     sensor_from_view = np.vstack([invert_rigid(view_from_sensor), [0.0, 0.0, 0.0, 1.0]])
@@ -210,23 +145,24 @@ def similarity_scale(sparse: Path, data: Path, view_from_sensor: FloatArray) -> 
 
 
 # --------------------------------------------------------------------------- comparison
-def compare(
-    workspace: Path, model: pycolmap.Reconstruction, data: Path, view_from_sensor: FloatArray
-) -> Iterator[Comparison]:
+def compare(workspace: DenseWorkspace, data: Path, view_from_sensor: FloatArray) -> Iterator[Comparison]:
     """All images that have a map and a reading of the sensor, in the order of their names.
 
     Raises:
         InputError: there are none, or a file is not as it should be.
     """
+    model = workspace.model
     images = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: str(image.name))
     seen = [image for image in images if (data / "depth" / Path(image.name).with_suffix(".png").name).is_file()]
     if not seen:
-        raise InputError(f"{data / 'depth'}: has none of the {len(images)} images of {workspace}; is it the same set?")
+        raise InputError(
+            f"{data / 'depth'}: has none of the {len(images)} images of {workspace.folder}; is it the same set?"
+        )
     sensor = TrueScene.from_rgbd_folder(data, [image.name for image in seen], max_size=NO_LIMIT_PX)
     num_maps = 0
     for k, image in enumerate(seen):
-        camera = Intrinsics.from_colmap(model.camera(image.camera_id))
-        depth = read_depth_map(workspace / f"stereo/depth_maps/{image.name}.geometric.bin", camera)
+        camera = workspace.camera(image.name)
+        depth = workspace.depth(image.name)
         if depth is None:
             depth = np.zeros((camera.height, camera.width), np.float32)  # which counts as nothing covered
         else:
@@ -241,36 +177,12 @@ def compare(
             num_behind=num_behind,
         )
     if not num_maps:
-        raise InputError(f"{workspace / 'stereo/depth_maps'}: has no map of the {len(seen)} images with a reading")
+        raise InputError(
+            f"{workspace.folder / 'stereo/depth_maps'}: has no map of the {len(seen)} images with a reading"
+        )
 
 
-def depth_in_view(depth: FloatMap, sensor: Intrinsics, view_from_sensor: FloatArray, view: Intrinsics) -> FloatMap:
-    """(H, W) what a sensor measured, as a camera beside it sees it; 0 where there is no reading.
-
-    Args:
-        depth: (h, w) z-depth of the sensor, 0 for none.
-        sensor: of an image of w x h pixels.
-        view_from_sensor: (3, 4) rigid, in the unit of the depth.
-        view: the camera, of H x W pixels.
-    """
-    repeats = math.ceil(READINGS_PER_PIXEL * max(view.width / sensor.width, view.height / sensor.height))
-    dense = np.repeat(np.repeat(depth, repeats, axis=0), repeats, axis=1).ravel()
-    read = dense > 0
-    rays = sensor.resized(sensor.width * repeats, sensor.height * repeats).rays_cam(
-        pixel_centres(sensor.width * repeats, sensor.height * repeats)
-    )
-    points_sensor = rays[read] * dense[read, None]
-    return z_buffer(points_sensor @ view_from_sensor[:, :3].T + view_from_sensor[:, 3], view)
-
-
-def map_ratios(depth: FloatMap, truth: FloatMap) -> FloatArray:
-    """(P,) of two maps (H, W), at the pixels where both have depth."""
-    both = (depth > 0) & (truth > 0)
-    ratios: FloatArray = depth[both].astype(np.float64) / truth[both]
-    return ratios
-
-
-def point_ratios(model: pycolmap.Reconstruction, image: pycolmap.Image, truth: FloatMap) -> tuple[FloatArray, int]:
+def point_ratios(model: pycolmap.Reconstruction, image: pycolmap.Image, truth: Float32Array) -> tuple[FloatArray, int]:
     """(Q,) depth of the points that an image observes, over the truth (H, W) in their pixel, where there is any.
 
     Points that are not before the camera are left out and counted: their ratio means nothing.
@@ -300,33 +212,10 @@ def scale_of_depth(comparisons: Sequence[Comparison]) -> float:
     return float(1 / np.median(ratios))
 
 
-def pooled(what: str, comparisons: Sequence[Comparison], scale: float) -> Figures:
+def pooled(what: str, comparisons: Sequence[Comparison], scale: float) -> DepthErrors:
     """The pixels of several images as one."""
     ratios = np.concatenate([one.ratios for one in comparisons])
-    return figures(what, ratios * scale, sum(one.num_true for one in comparisons))
-
-
-def figures(what: str, ratios: FloatArray, num_true: int | None) -> Figures:
-    """Of ratios (P,) above 0, after the scale, 1 where depth is right; ``num_true`` None for no coverage.
-
-    Source: Eigen et al. 2014, section 4.2, for the measures of depth; 1.05 and 1.25 are thresholds of their delta.
-    """
-    errors = np.abs(ratios - 1)
-    factors = np.maximum(ratios, 1 / ratios)
-    return Figures(
-        what=what,
-        num_compared=len(ratios),
-        abs_rel=mean_of(errors),
-        median_rel=float(np.median(errors)) if len(errors) else math.nan,
-        delta_105=mean_of(factors < 1.05),
-        delta_125=mean_of(factors < 1.25),
-        coverage=len(ratios) / num_true if num_true else math.nan,
-    )
-
-
-def mean_of(values: npt.NDArray[np.float64] | npt.NDArray[np.bool_]) -> float:
-    """NaN of none."""
-    return float(values.mean()) if len(values) else math.nan
+    return DepthErrors.of(what, ratios * scale, sum(one.num_true for one in comparisons))
 
 
 # ------------------------------------------------------------------------------- output

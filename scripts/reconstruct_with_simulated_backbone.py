@@ -26,12 +26,12 @@ from pathlib import Path, PurePosixPath
 import cv2
 import numpy as np
 import numpy.typing as npt
-from benchmark_plane_sweep import COLOUR_FROM_SENSOR
-from judge_depth_maps import NO_LIMIT_PX, depth_in_view
+from judge_depth_maps import NO_LIMIT_PX
 
 from smust3r_colmap.backbones.base import BackboneContext, BackboneFactory
 from smust3r_colmap.config import OutputConfig, RunConfig
 from smust3r_colmap.errors import InputError, SmustrError
+from smust3r_colmap.evaluation.depth_error import KINECT_COLOUR_FROM_SENSOR, depth_in_view
 from smust3r_colmap.execution.progress import reporter_for
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
@@ -176,7 +176,7 @@ def colour_scene(data: Path, names: Sequence[str]) -> TrueScene:
         )
     return TrueScene(
         names=sensor.names,
-        world_from_cam=sensor.world_from_cam @ homogeneous(invert_rigid(COLOUR_FROM_SENSOR)),
+        world_from_cam=sensor.world_from_cam @ homogeneous(invert_rigid(KINECT_COLOUR_FROM_SENSOR)),
         intrinsics=COLOUR_CAMERA.resized(*MAP_SIZE_PX),
         metric=sensor.metric,
         views=ColourViews(sensor),
@@ -199,7 +199,7 @@ class ColourViews:
         """(H, W) z-depth of image k in metres, 0 where the sensor measured nothing."""
         if k not in self._depths:
             measured = self._sensor.depth(k)
-            self._depths[k] = depth_in_view(measured, self._sensor.intrinsics, COLOUR_FROM_SENSOR, self._camera)
+            self._depths[k] = depth_in_view(measured, self._sensor.intrinsics, KINECT_COLOUR_FROM_SENSOR, self._camera)
         return self._depths[k]
 
     def rgb(self, k: int) -> RgbImage:

@@ -33,6 +33,7 @@ PoseLayout = Literal["tum", "eth3d-slam", "7-scenes", "kitti", "euroc", "poses-t
 PoseAlignment = Literal["sim3", "se3", "none"]
 AssociationKey = Literal["auto", "name", "number", "time"]
 DeltaUnit = Literal["frames", "m"]
+DepthRegistration = Literal["none", "kinect"]
 
 MAX_POSE_TOLERANCE = 0.2
 """Beyond it hardly a match is refused, and the poses count for nothing."""
@@ -406,6 +407,9 @@ class EvaluateConfig:
     """Of the positions of the reference, in its unit; for auc_colmap, shorter baselines have no direction."""
     unit: str = ""
     """Unit of length of the reference, such as m, where its layout does not say; KITTI's segments need m."""
+    depth_registration: DepthRegistration = "none"
+    """Where the colour camera is, seen from the depth sensor of the reference: in the same place, or a Kinect's nominal
+    one. Needs metres."""
     cloud_thresholds: tuple[float, ...] = (0.01, 0.02, 0.05)
     """Distances that accuracy, completeness and F-score of clouds are given for, in the unit of the reference."""
 

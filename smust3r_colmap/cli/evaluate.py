@@ -19,6 +19,7 @@ from smust3r_colmap.report.summary import EXIT_DEGRADED, EXIT_GOOD
 
 if TYPE_CHECKING:
     from smust3r_colmap.geometry.arrays import FloatArray
+    from smust3r_colmap.importers.workspace_depth import DenseWorkspace
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +78,14 @@ def run_evaluate(command: Evaluate) -> int:
                 (command.reference, command.reference_layout),
             )
         )
-        found = evaluate(models, reference, command.settings, sigmas=_sigmas(models[0].place), clouds=_clouds(command))
+        found = evaluate(
+            models,
+            reference,
+            command.settings,
+            sigmas=_sigmas(models[0].place),
+            clouds=_clouds(command),
+            workspace=_workspace(models[0].place),
+        )
         for file, render in ((command.json, render_json), (command.csv, render_csv)):
             if file is not None:
                 write_atomically(file, render(found).encode())
@@ -94,6 +102,14 @@ def _sigmas(model: Path) -> dict[str, float] | None:
 
     table = model.parent.parent / UNCERTAINTY_FILE
     return read_position_sigmas(table, f"{model.parent.name}/{model.name}") if table.is_file() else None
+
+
+def _workspace(model: Path) -> DenseWorkspace | None:
+    """The dense workspace that the model is of, or that a run has beside its largest model."""
+    from smust3r_colmap.importers.workspace_depth import DenseWorkspace  # noqa: PLC0415
+
+    places = [model.parent, *([model.parent.parent / "dense"] if model.name == "0" else [])]
+    return next((DenseWorkspace.open(one) for one in places if (one / "stereo/depth_maps").is_dir()), None)
 
 
 def _clouds(command: Evaluate) -> tuple[FloatArray, FloatArray] | None:

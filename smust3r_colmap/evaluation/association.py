@@ -87,8 +87,13 @@ def _example(poses: PoseSet) -> str:
 def _by_name(estimate: PoseSet, reference: PoseSet) -> Association | None:
     if not (estimate.names and reference.names):
         return None
-    exact = _equal(estimate.names, reference.names, "image name")
-    stems_est, stems_ref = _unique_stems(estimate.names), _unique_stems(reference.names)
+    return match_names(estimate.names, reference.names)
+
+
+def match_names(names_est: Sequence[str], names_ref: Sequence[str]) -> Association:
+    """Rows of equal names; where there are none, of names that are equal and unique without folder and suffix."""
+    exact = _equal(names_est, names_ref, "image name")
+    stems_est, stems_ref = _unique_stems(names_est), _unique_stems(names_ref)
     if len(exact) or stems_est is None or stems_ref is None:
         return exact
     return _equal(stems_est, stems_ref, "image name without folder and suffix")
@@ -96,7 +101,7 @@ def _by_name(estimate: PoseSet, reference: PoseSet) -> Association | None:
 
 def _unique_stems(names: Sequence[str]) -> tuple[str, ...] | None:
     stems = tuple(PurePosixPath(name).stem for name in names)
-    return stems if max(Counter(stems).values()) == 1 else None
+    return stems if max(Counter(stems).values(), default=1) == 1 else None
 
 
 def _by_number(estimate: PoseSet, reference: PoseSet) -> Association | None:

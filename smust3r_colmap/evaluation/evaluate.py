@@ -22,14 +22,16 @@ from smust3r_colmap.evaluation.absolute_error import (
     position_errors,
     rotation_errors_deg,
 )
-from smust3r_colmap.evaluation.association import Association, associate
+from smust3r_colmap.evaluation.association import Association, associate, match_names
 from smust3r_colmap.evaluation.cloud_error import CloudErrors, cloud_errors
+from smust3r_colmap.evaluation.depth_error import VIEW_FROM_SENSOR, DepthErrors, depth_in_view, map_ratios
 from smust3r_colmap.evaluation.pairwise_auc import COLMAP_THRESHOLDS_DEG, VGGT_THRESHOLDS_DEG, auc_colmap, auc_vggt
 from smust3r_colmap.evaluation.predicted_error import PredictedErrors
 from smust3r_colmap.evaluation.relative_error import pairs_at, relative_errors, segment_errors
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import Sim3
-from smust3r_colmap.importers.pose_set import PoseSet
+from smust3r_colmap.importers.pose_set import DepthFiles, PoseSet
+from smust3r_colmap.importers.workspace_depth import DenseWorkspace, read_depth_image
 
 MIN_COMPARED = 3
 """Two centres fit any other two."""
@@ -37,6 +39,8 @@ _LINE = 1e-6
 """Relative width of centres that are on a line but for rounding."""
 _MAX_IMAGES_IN_PAIRS = 10_000
 """All pairs of more would take minutes, and gigabytes."""
+_MAX_DEPTHS = 20_000_000
+"""More pixels are thinned evenly: their ratios are held in memory for the median."""
 _SUSPECT_DEG, _SUSPECT_FACTOR = 5.0, 5.0
 """Orientations that are off by so much, and agree so many times better with the quaternion in another order."""
 
@@ -115,6 +119,7 @@ def evaluate(
     *,
     sigmas: Mapping[str, float] | None = None,
     clouds: tuple[FloatArray, FloatArray] | None = None,
+    workspace: DenseWorkspace | None = None,
 ) -> Evaluation:
     """Compare the first model with the reference; the others count in COLMAP's area under the curve only.
 
@@ -122,6 +127,7 @@ def evaluate(
         models: of the estimate, largest first.
         sigmas: predicted standard deviations by image name, in units of the first model.
         clouds: points (N, 3) in the world of the first model, and (M, 3) of the reference.
+        workspace: with depth maps in the world of the first model, to compare with the depth of the reference.
 
     Raises:
         InputError: no pose of the one has a pose in the other.
@@ -147,6 +153,7 @@ def evaluate(
         *_pairs(compared, models, reference, associations),
         *([] if sigmas is None else [_predicted(compared, sigmas)]),
         *([] if clouds is None else _cloud(compared, *clouds)),
+        *([] if workspace is None or reference.depth is None else _depth(compared, workspace, reference.depth)),
     ]
     return Evaluation(
         estimate=_described(first),
@@ -211,9 +218,7 @@ def _absolute(compared: _Compared) -> Iterator[Row]:
         "aae",
         dict.fromkeys(angles) if is_line else angles,
         "deg",
-        note="not determined: the centres are on a line"
-        if is_line
-        else "orientations as the fit of the centres has them",
+        note="not determined: the centres are on a line" if is_line else "orientations after the fit of the centres",
     )
     try:
         turned = align_rotations(compared.estimated, compared.reference)
@@ -322,7 +327,9 @@ def _pairs(
             "%",
             "none",
             note=f"{missing} images of the reference have no pose and {unknown} of the estimate are unknown to it: all "
-            "their pairs count as 180 deg",
+            "their pairs count as 180 deg"
+            if missing or unknown
+            else "",
         )
     yield compared.row("auc_colmap_compared", _by_threshold(COLMAP_THRESHOLDS_DEG, alone), "%", "none")
     yield compared.row(
@@ -373,6 +380,47 @@ def _cloud(compared: _Compared, estimated: FloatArray, reference: FloatArray) ->
         values = {"accuracy": share.accuracy, "completeness": share.completeness, "f_score": share.f_score}
         metric = f"cloud_within_{share.threshold:g}_{compared.unit}"
         yield compared.row(metric, values, "%", alignment, note=note)
+
+
+def _depth(compared: _Compared, workspace: DenseWorkspace, truth: DepthFiles) -> Iterator[Row]:
+    """At the scale of the cameras, and at the one that makes the median ratio 1."""
+    names, names_ref = workspace.names, tuple(truth.files)
+    matched = match_names(names, names_ref)
+    pairs = [(names[a], truth.files[names_ref[b]]) for a, b in zip(matched.estimate, matched.reference, strict=True)]
+    if truth.intrinsics is None or not pairs:
+        why = "no image has both a map and depth in the reference" if not pairs else "its layout has no intrinsics"
+        yield compared.row("depth", {"abs_rel": None}, "", note=f"depth of the reference is not compared: {why}")
+        return
+    registration = compared.options.depth_registration
+    num_pixels = sum(workspace.camera(name).width * workspace.camera(name).height for name, _ in pairs)
+    step = 1 + num_pixels // _MAX_DEPTHS
+    found, num_compared, num_true = [], 0, 0
+    for name, path in pairs:
+        view, depth = workspace.camera(name), workspace.depth(name)
+        measured = read_depth_image(path, truth.per_unit)
+        sensor = truth.intrinsics.resized(measured.shape[1], measured.shape[0])
+        seen = depth_in_view(measured, sensor, VIEW_FROM_SENSOR[registration], view)
+        ratios = np.empty(0) if depth is None else map_ratios(depth, seen)
+        found.append(ratios[::step])
+        num_compared, num_true = num_compared + len(ratios), num_true + int((seen > 0).sum())
+    ratios = np.concatenate(found)
+    scale = float(align_centres(compared.estimated, compared.reference, compared.options.align).scale)
+    for metric, factor in (("depth", scale), ("depth_median_scaled", 1 / np.median(ratios) if len(ratios) else 1.0)):
+        errors = DepthErrors.of(metric, factor * ratios, None)
+        values = {
+            "abs_rel": errors.abs_rel,
+            "median_rel": errors.median_rel,
+            "delta_1.05": errors.delta_105,
+            "delta_1.25": errors.delta_125,
+            "coverage": num_compared / num_true if num_true else np.nan,
+        }
+        yield compared.row(
+            metric,
+            {name: None if np.isnan(value) else float(value) for name, value in values.items()},
+            "",
+            note=f"{len(pairs)} images, {num_compared} pixels{f', every {step}th taken' if step > 1 else ''}; scale "
+            f"{factor:.5g}; registration {registration}",
+        )
 
 
 def _cloud_alignment(compared: _Compared) -> tuple[Sim3, str]:

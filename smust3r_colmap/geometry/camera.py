@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from smust3r_colmap.geometry.arrays import FloatArray
+from smust3r_colmap.geometry.arrays import Float32Array, FloatArray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,3 +137,13 @@ def _pixel_rays_cam(intrinsics: Intrinsics) -> FloatArray:
     rays = intrinsics.rays_cam(pixel_centres(intrinsics.width, intrinsics.height))
     rays.flags.writeable = False
     return rays
+
+
+def z_buffer(points_cam: FloatArray, intrinsics: Intrinsics) -> Float32Array:
+    """(H, W) depth of the nearest of the points (P, 3) that fall into each pixel, 0 where none does."""
+    xy_img = intrinsics.xy_img(points_cam)
+    inside = ((xy_img >= 0) & (xy_img < (intrinsics.width, intrinsics.height))).all(axis=1)
+    columns, rows = xy_img[inside].astype(int).T
+    nearest = np.full((intrinsics.height, intrinsics.width), np.inf, dtype=np.float32)
+    np.minimum.at(nearest, (rows, columns), points_cam[inside, 2].astype(np.float32))
+    return np.where(np.isfinite(nearest), nearest, np.float32(0))

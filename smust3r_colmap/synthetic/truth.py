@@ -20,7 +20,7 @@ from PIL import Image, UnidentifiedImageError
 
 from smust3r_colmap.errors import CollectionError, ImageError, InputError
 from smust3r_colmap.geometry.arrays import FloatArray
-from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
+from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres, z_buffer
 from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.importers.images import load_rgb
 from smust3r_colmap.importers.poses_txt import read_poses_txt
@@ -257,16 +257,6 @@ class _RgbdViews:
         pose = self._world_from_cams[name]
         points: FloatArray = points_cam @ pose[:, :3].T + pose[:, 3]
         return points
-
-
-def z_buffer(points_cam: FloatArray, intrinsics: Intrinsics) -> DepthMap:
-    """(H, W) depth of the nearest of the points (P, 3) that fall into each pixel, 0 where none does."""
-    xy_img = intrinsics.xy_img(points_cam)
-    inside = ((xy_img >= 0) & (xy_img < (intrinsics.width, intrinsics.height))).all(axis=1)
-    columns, rows = xy_img[inside].astype(int).T
-    nearest = np.full((intrinsics.height, intrinsics.width), np.inf, dtype=np.float32)
-    np.minimum.at(nearest, (rows, columns), points_cam[inside, 2].astype(np.float32))
-    return np.where(np.isfinite(nearest), nearest, np.float32(0))
 
 
 def _depth_path(folder: Path, name: str) -> Path:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.finished_runs import Example
+from helpers.sensor_depth import write_data, write_run
 
 from smust3r_colmap.cli.main import main
 from smust3r_colmap.geometry.arrays import FloatArray
@@ -39,7 +40,7 @@ def test_tables_and_files_have_the_same_figures(
     spread = np.sqrt(((WALK - WALK.mean(axis=0)) ** 2).sum(axis=1).mean())
     assert rows["ape_translation"]["values"]["rmse"] == pytest.approx(spread)
     assert rows["scale"]["values"] == pytest.approx({"scale": 2, "error_percent": 100})
-    assert rows["ape_translation"]["unit"] == "m"
+    assert rows["ape_translation"]["unit"] == "units"
     assert rows["ape_translation"]["association"] == "time within 0.01 s"
     assert f"ape_translation       {spread:.4g}" in printed
     table = list(csv.DictReader((tmp_path / "rows.csv").open()))
@@ -138,8 +139,35 @@ def test_clouds_are_compared(pair: list[str], tmp_path: Path) -> None:
     assert main(["evaluate", *pair, *flags]) == 0
     rows = {row["metric"]: row["values"] for row in json.loads((tmp_path / "rows.json").read_text())["rows"]}
     assert rows["cloud_chamfer"]["mean"] == pytest.approx(0.03)
-    assert rows["cloud_within_0.02_m"] == {"accuracy": 0, "completeness": 0, "f_score": 0}
-    assert rows["cloud_within_0.04_m"] == {"accuracy": 100, "completeness": 100, "f_score": 100}
+    assert rows["cloud_within_0.02_units"] == {"accuracy": 0, "completeness": 0, "f_score": 0}
+    assert rows["cloud_within_0.04_units"] == {"accuracy": 100, "completeness": 100, "f_score": 100}
+
+
+def test_depth_maps_of_a_workspace_are_compared_with_the_sensor(tmp_path: Path) -> None:
+    """One of three maps is a tenth too deep; the model's unit is a quarter of a metre."""
+    data = write_data(tmp_path / "data")
+    run = write_run(tmp_path / "run", {"a.jpg": 1.0, "b.jpg": 1.0, "c.jpg": 1.1}, holes=45)
+    rows = {}
+    for registration in ("kinect", "none"):
+        flags = ["--depth-registration", registration, "--json", str(tmp_path / "rows.json"), "--quiet"]
+        assert main(["evaluate", str(run / "dense"), str(data), *flags]) == 0
+        rows[registration] = {row["metric"]: row for row in json.loads((tmp_path / "rows.json").read_text())["rows"]}
+    found = rows["kinect"]["depth"]["values"]
+    assert found["abs_rel"] == pytest.approx(0.1 / 3, abs=0.01)
+    assert found["delta_1.05"] == pytest.approx(2 / 3, abs=0.03)
+    assert found["delta_1.25"] > 0.98
+    assert found["coverage"] == pytest.approx(41 / 84, abs=0.02)  # the maps begin at row 45 of 90
+    assert "3 images" in rows["kinect"]["depth"]["note"]
+    assert "registration kinect" in rows["kinect"]["depth"]["note"]
+    assert rows["kinect"]["depth_median_scaled"]["values"]["median_rel"] < 0.01
+    assert rows["none"]["depth"]["values"]["abs_rel"] > found["abs_rel"]
+
+
+def test_depth_that_cannot_be_compared_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data, run = write_data(tmp_path / "data"), write_run(tmp_path / "run", {"a.jpg": 1.0})
+    (data / "intrinsics.txt").unlink()
+    assert main(["evaluate", str(run / "dense"), str(data)]) == 0
+    assert "depth of the reference is not compared: its layout has no intrinsics" in capsys.readouterr().out
 
 
 def test_help_names_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:

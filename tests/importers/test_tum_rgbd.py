@@ -21,7 +21,7 @@ def test_a_line_is_time_centre_and_quaternion_with_the_scalar_last(tmp_path: Pat
     np.testing.assert_array_equal(poses.stamps_s, [1305031102.0, 1305031102.25])
     np.testing.assert_allclose(poses.world_from_cam[0], np.column_stack([np.eye(3), [4, 5, 6]]))
     np.testing.assert_allclose(poses.world_from_cam[1], [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]], atol=1e-8)
-    assert (poses.unit, poses.names, poses.numbers) == ("m", (), None)
+    assert (poses.unit, poses.names, poses.numbers) == ("units", (), None)
 
 
 def test_whole_times_are_numbers_of_frames(tmp_path: Path) -> None:
@@ -57,7 +57,7 @@ def test_a_folder_has_truth_times_of_images_and_the_depth_nearest_in_time(tmp_pa
     (tmp_path / "rgb.txt").write_text("# color images\n10.11 rgb/10.11.png\n11.0 rgb/11.0.png\n")
     (tmp_path / "depth.txt").write_text("# depth maps\n10.10 depth/a.png\n10.115 depth/b.png\n11.03 depth/c.png\n")
     poses = read_tum_folder(tmp_path)
-    assert poses.layout == "TUM RGB-D"
+    assert (poses.layout, poses.unit) == ("TUM RGB-D", "m")
     assert poses.image_stamps == {"rgb/10.11.png": 10.11, "rgb/11.0.png": 11.0}
     assert poses.depth is not None
     # c is 0.03 s after the other image, which has none.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
 from pathlib import Path
 
 import judge_depth_maps as judge
@@ -12,82 +11,15 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 import pytest
-from helpers.dense_scenes import cameras_from_world, exact_depth, picture
-from PIL import Image
-from scipy.spatial.transform import Rotation
+from helpers.sensor_depth import NAMES, UNIT_M, VIEW, write_data, write_run
 
 from smust3r_colmap.errors import InputError
 from smust3r_colmap.exporters.dense_workspace import write_map
-from smust3r_colmap.geometry.arrays import FloatArray
-from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
-from smust3r_colmap.geometry.sim3 import invert_rigid
 
 FloatMap = npt.NDArray[np.float32]
 
-VIEW = Intrinsics(model="PINHOLE", width=120, height=90, params=(100.0, 102.0, 61.0, 44.0))
-SENSOR = Intrinsics(model="PINHOLE", width=160, height=120, params=(146.0, 146.0, 80.0, 60.0))
-NAMES = ("a.jpg", "b.jpg", "c.jpg", "d.jpg")
-UNIT_M = 0.25  # of the model
-
-
-def steps(sensor: Intrinsics) -> FloatMap:
-    """A near plane on the left half and a far one on the right."""
-    depth = np.full((sensor.height, sensor.width), 4.0, np.float32)
-    depth[:, : sensor.width // 2] = 2.0
-    return depth
-
-
-# ------------------------------------------------------------------------- registration
-def test_a_sensor_in_the_place_of_the_camera_is_seen_pixel_by_pixel() -> None:
-    depth = np.random.default_rng(0).uniform(1, 5, (90, 120)).astype(np.float32)
-    depth[10:20, 30:50] = 0
-    np.testing.assert_array_equal(judge.depth_in_view(depth, VIEW, np.eye(3, 4), VIEW), depth)
-
-
-def test_a_sensor_beside_the_camera_sees_the_scene_as_the_camera_does() -> None:
-    """Both look at a ball before a wall; away from edges and within what both see, drawn and true depth agree."""
-    view_from_sensor = np.column_stack([Rotation.from_rotvec([0.01, -0.02, 0.005]).as_matrix(), [-0.03, 0.01, 0.02]])
-    sensor_from_world = cameras_from_world()[2]
-    view_from_world = compose(view_from_sensor, sensor_from_world)
-    measured = exact_depth(SENSOR, sensor_from_world)
-    seen = judge.depth_in_view(measured, SENSOR, view_from_sensor, VIEW)
-    truth = exact_depth(VIEW, view_from_world)
-    read = seen > 0
-    assert 0.85 < read.mean() <= 1
-    error = np.abs(seen[read] / truth[read] - 1)
-    assert np.quantile(error, 0.95) < 0.01
-    # Half a pixel of the view, or the registration left out, would show.
-    shifted = judge.depth_in_view(measured, SENSOR, np.eye(3, 4), VIEW)
-    both = read & (shifted > 0)
-    assert np.median(np.abs(shifted[both] / truth[both] - 1)) > 5 * np.median(np.abs(seen[both] / truth[both] - 1))
-
-
-def test_of_two_surfaces_in_a_pixel_the_nearer_is_taken() -> None:
-    moved = np.column_stack([np.eye(3), [0.4, 0.0, 0.0]])  # the near plane slides over the far one
-    seen = judge.depth_in_view(steps(VIEW), VIEW, moved, VIEW)
-    edge_near = 60 + 100 * 0.4 / 2.0
-    edge_far = 60 + 100 * 0.4 / 4.0
-    assert (seen[:, 25 : int(edge_near)] == 2).all()
-    assert edge_far < edge_near
-    assert (seen[:, int(edge_near) + 1 :] == 4).all()
-
-
-@pytest.mark.parametrize("size", [(160, 120), (400, 300)])
-def test_a_view_larger_than_the_sensor_has_no_holes(size: tuple[int, int]) -> None:
-    view = SENSOR.resized(*size).zoomed(1.05)
-    seen = judge.depth_in_view(steps(SENSOR), SENSOR, np.eye(3, 4), view)
-    assert (seen > 0).all()
-
 
 # ----------------------------------------------------------------------------- measures
-def test_measures_are_those_of_the_ratios() -> None:
-    ratios = np.array([1.0, 1.04, 1 / 1.04, 1.06, 1 / 1.06, 1.3])
-    found = judge.figures("", ratios, 12)
-    assert found.abs_rel == pytest.approx((0.04 + 1 - 1 / 1.04 + 0.06 + 1 - 1 / 1.06 + 0.3) / 6)
-    assert found.median_rel == pytest.approx((0.04 + 1 - 1 / 1.06) / 2)
-    assert (found.delta_105, found.delta_125, found.coverage) == (3 / 6, 5 / 6, 6 / 12)
-
-
 def test_points_that_are_not_before_their_camera_are_counted_and_not_compared() -> None:
     """A point as far behind the camera as the surface is before it would be off by nothing."""
     model, truth = pycolmap.Reconstruction(), np.full((VIEW.height, VIEW.width), 2, np.float32)
@@ -101,13 +33,6 @@ def test_points_that_are_not_before_their_camera_are_counted_and_not_compared() 
     assert (ratios.tolist(), num_behind) == ([1.0, 1.5], 2)
 
 
-def test_what_cannot_be_compared_has_no_figures() -> None:
-    nothing = judge.figures("", np.empty(0), 7)
-    assert nothing.coverage == 0
-    assert math.isnan(nothing.abs_rel) and math.isnan(nothing.median_rel) and math.isnan(nothing.delta_105)
-    assert judge.without_nan({"a": [math.nan, 1.0], "b": "x"}) == {"a": [None, 1.0], "b": "x"}
-
-
 def test_one_scale_is_taken_of_all_pixels_together() -> None:
     small, large = (
         judge.Comparison(name=name, num_true=count, ratios=np.full(count, ratio), point_ratios=np.empty(0))
@@ -118,70 +43,11 @@ def test_one_scale_is_taken_of_all_pixels_together() -> None:
         judge.scale_of_depth([judge.Comparison(name="", num_true=9, ratios=np.empty(0), point_ratios=np.empty(0))])
 
 
+def test_json_has_null_for_what_could_not_be_compared() -> None:
+    assert judge.without_nan({"a": [math.nan, 1.0], "b": "x"}) == {"a": [None, 1.0], "b": "x"}
+
+
 # --------------------------------------------------------------------------- the script
-def compose(c_from_b: FloatArray, b_from_a: FloatArray) -> FloatArray:
-    """(3, 4) rigid."""
-    return np.column_stack([c_from_b[:, :3] @ b_from_a[:, :3], c_from_b[:, :3] @ b_from_a[:, 3] + c_from_b[:, 3]])
-
-
-def view_poses() -> dict[str, FloatArray]:
-    """``cam_from_world`` in metres."""
-    return dict(zip(NAMES, cameras_from_world(len(NAMES)), strict=True))
-
-
-def write_data(folder: Path) -> Path:
-    """What the nominal Kinect beside each view measures; ``d.jpg`` has no depth."""
-    for name in ("images", "depth"):
-        (folder / name).mkdir(parents=True)
-    lines = []
-    for name, view_from_world in view_poses().items():
-        sensor_from_world = compose(invert_rigid(judge.REGISTRATIONS["kinect"]), view_from_world)
-        world_from_sensor = invert_rigid(sensor_from_world)
-        x, y, z, w = Rotation.from_matrix(world_from_sensor[:, :3]).as_quat()
-        lines.append(" ".join(map(str, (name, w, x, y, z, *world_from_sensor[:, 3]))))
-        Image.fromarray(picture(VIEW, view_from_world)).save(folder / "images" / name)
-        if name != "d.jpg":
-            millimetres = np.rint(1000 * exact_depth(SENSOR, sensor_from_world)).astype(np.uint16)
-            millimetres[:, :16] = 0
-            Image.fromarray(millimetres).save(folder / "depth" / f"{name[:-4]}.png")
-    (folder / "poses.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    values = (SENSOR.width, SENSOR.height, *SENSOR.params)
-    (folder / "intrinsics.txt").write_text(" ".join(map(str, values)), encoding="utf-8")
-    return folder
-
-
-def write_run(folder: Path, factors: Mapping[str, float], *, holes: int = 0) -> Path:
-    """A dense workspace in units of ``UNIT_M``, each depth map wrong by its factor and empty in the first rows."""
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(VIEW.colmap_camera(1))
-    seen: list[list[pycolmap.TrackElement]] = []
-    places = []
-    for number, (name, pose) in enumerate(view_poses().items(), start=1):
-        in_units = np.column_stack([pose[:, :3], pose[:, 3] / UNIT_M])
-        depth = exact_depth(VIEW, pose) / np.float32(UNIT_M)
-        image = pycolmap.Image(name=name, camera_id=1, image_id=number)
-        xy, points_world = some_points(depth, in_units)
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(one) for one in xy])
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(in_units))
-        seen += [[pycolmap.TrackElement(number, k)] for k in range(len(xy))]
-        places += list(points_world)
-        if name in factors:
-            depth[:holes] = 0
-            write_map(folder / f"dense/stereo/depth_maps/{name}.geometric.bin", depth * np.float32(factors[name]))
-    for place, elements in zip(places, seen, strict=True):
-        model.add_point3D(place, pycolmap.Track(elements), np.zeros(3, np.uint8))
-    (folder / "dense/sparse").mkdir(parents=True)
-    model.write_binary(folder / "dense/sparse")
-    return folder
-
-
-def some_points(depth: FloatMap, cam_from_world: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(N, 2) pixel centres and (N, 3) what is seen there."""
-    xy = pixel_centres(VIEW.width, VIEW.height)[::371]
-    points_cam = VIEW.rays_cam(xy) * depth[xy[:, 1].astype(int), xy[:, 0].astype(int), None]
-    return xy, (points_cam - cam_from_world[:, 3]) @ cam_from_world[:, :3]
-
-
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_data(tmp_path_factory.mktemp("data"))

@@ -32,7 +32,7 @@ from smust3r_colmap.synthetic.backbone import (
 from smust3r_colmap.synthetic.descriptors import FALSE_COSINE, FalseLoop, overlap_matrix
 from smust3r_colmap.synthetic.room import demo_intrinsics
 from smust3r_colmap.synthetic.settings import PRESETS, REFERENCE_LENGTH, SimulationSettings
-from smust3r_colmap.synthetic.truth import TYPICAL_DEPTH_IMAGES, TrueScene, collection_of, z_buffer
+from smust3r_colmap.synthetic.truth import TYPICAL_DEPTH_IMAGES, TrueScene, collection_of
 
 PERFECT = PRESETS["perfect"]
 HEIGHT, WIDTH, NUM_IMAGES = 48, 64, 120
@@ -598,14 +598,6 @@ def test_pixels_without_depth_stay_without(rgbd_folder: Path) -> None:
     assert np.isnan(maps.pointmap_seg(0)[0, 0]).all()
     assert maps.depth(0)[0, 0] == 0
     assert maps.confidence(0)[0, 0] == 1
-
-
-def test_z_buffer_keeps_the_nearest_and_nothing_behind_the_camera() -> None:
-    camera = Intrinsics(model="PINHOLE", width=4, height=2, params=(2.0, 2.0, 2.0, 1.0))
-    points = np.array([[0.1, 0.1, 3.0], [0.1, 0.1, 2.0], [0.1, 0.1, -1.0], [9.0, 0.0, 1.0], [-1.9, -0.9, 2.0]])
-    expected = np.zeros((2, 4), dtype=np.float32)
-    expected[1, 2], expected[0, 0] = 2.0, 2.0
-    np.testing.assert_array_equal(z_buffer(points, camera), expected)
 
 
 @pytest.mark.data
