@@ -222,3 +222,32 @@ def test_what_the_readers_noted_is_a_warning_and_a_model_as_reference_a_note() -
 def test_a_step_longer_than_the_path_has_no_figure() -> None:
     found = evaluate([pose_set()], pose_set(), EvaluateConfig(rpe_delta=12))
     assert row(found, "rpe").values == {"rmse": None}
+
+
+COLMAP_AUC = {
+    0.0: (9.492655643386524, 35.52107032126364, 40.98477334029917),
+    0.01: (9.488557282730786, 36.591956966149006, 42.28304303214842),
+    0.5: (11.904850505547428, 37.39738804042121, 42.76630167671175),
+}
+"""At 1, 3 and 5 degrees, by the accuracy of the reference."""
+
+
+def test_pairs_count_as_in_colmaps_own_benchmark() -> None:
+    """Two models that share images, unknown images, missing ones, noise, baselines below the accuracy.
+
+    Numbers from COLMAP's benchmark/reconstruction/evaluation/utils.py at commit 5d968cf
+    (``compute_grouped_rel_errors`` and ``compute_auc``) on these poses.
+    """
+    rng = np.random.default_rng(11)
+    centres, rotvecs = rng.uniform(-2, 2, (12, 3)), rng.uniform(-1, 1, (12, 3))
+    centres[1] = centres[0] + 0.001
+    noisy = centres + 0.01 * rng.normal(size=centres.shape)
+    turned = Rotation.from_rotvec(0.005 * rng.normal(size=(12, 3))) * Rotation.from_rotvec(rotvecs)
+    reference = pose_set(centres[:10], Rotation.from_rotvec(rotvecs[:10]))
+    models = [
+        pose_set(noisy[3:], turned[3:], world=OTHER_WORLD, first=3),
+        pose_set(noisy[:5], turned[:5]),
+    ]
+    for accuracy, expected in COLMAP_AUC.items():
+        found = evaluate(models, reference, EvaluateConfig(reference_accuracy=accuracy))
+        assert list(row(found, "auc_colmap").values.values()) == pytest.approx(expected, abs=1e-6)
