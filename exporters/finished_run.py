@@ -161,6 +161,15 @@ def open_finished(run: RunDirectory, *, images: Path | None = None, output: Path
     )
 
 
+def image_folder_of(run: RunDirectory) -> Path:
+    """Where the images of a finished run were.
+
+    Raises:
+        RunDirectoryError, StorageError: as ``open_finished``.
+    """
+    return _read_parts(run).images
+
+
 def _read_parts(run: RunDirectory) -> _Parts:
     path = run.work / FINISHED_FILE
     facts = read_json(path)

@@ -24,6 +24,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -185,6 +186,28 @@ def load_grey(image: SourceImage) -> UInt8Array:
         ImageError: as ``load_rgb``.
     """
     return _load(image, grey=True)
+
+
+def load_small(path: Path, side_px: int) -> UInt8Array:
+    """(H, W, 3) upright pixels for people, of a JPEG at an eighth of the size at least; the longer side is not shorter
+    than ``side_px`` unless that of the file is. More than 8 bits are scaled by those in use in this file.
+
+    Raises:
+        ImageError: the file cannot be read; the message is the reason alone.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ImageError(f"cannot be read: {error.strerror}") from error
+    with _damage_refused():
+        image = open_image(data)
+        width, height = image.size
+        _check_size(width, height)
+        if isinstance(image, JpegImageFile):
+            factor = min(1.0, side_px / max(width, height))
+            image.draft("RGB", (round(width * factor), round(height * factor)))
+        with _LARGE_IMAGE_TURN if width * height > _LARGE_MEGAPIXELS * 1e6 else nullcontext():
+            return _decode(image, data, grey=False, orientation=orientation_to_apply(image), bits=None)
 
 
 def load_alpha(image: SourceImage) -> UInt8Array | None:

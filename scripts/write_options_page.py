@@ -27,6 +27,7 @@ from smust3r_colmap.cli.frames import Frames
 from smust3r_colmap.cli.presets import PRESETS
 from smust3r_colmap.cli.reconstruct import Reconstruct
 from smust3r_colmap.cli.refine import Refine
+from smust3r_colmap.cli.report import Report
 from smust3r_colmap.cli.validate import Validate
 from smust3r_colmap.cli.weights import ConvertWeights, FetchWeights, ListWeights, PathOfWeights, VerifyWeights
 from smust3r_colmap.storage.config_file import flags_from_settings
@@ -38,6 +39,7 @@ COMMANDS: Mapping[str, type] = {
     "refine": Refine,
     "frames": Frames,
     "export": Export,
+    "report": Report,
     "validate": Validate,
     "evaluate": Evaluate,
     "demo": Demo,

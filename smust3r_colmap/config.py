@@ -278,6 +278,8 @@ class ModelOutputConfig:
     """Write OUT/trainer, for splat and NeRF trainers: undistorted images, model, points and, if there is any, depth."""
     trainer_scales: tuple[int, ...] | None = None
     """Smaller copies of the trainer's images, such as 2,4,8 for images_2, images_4 and images_8."""
+    report: bool = True
+    """Write OUT/report.html, a page that shows what the result is worth."""
 
     def __post_init__(self) -> None:
         if self.trainer_scales is not None and (not self.trainer_scales or min(self.trainer_scales) < 2):

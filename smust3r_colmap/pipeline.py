@@ -32,6 +32,7 @@ from smust3r_colmap.exporters.finished_run import begin_stages
 from smust3r_colmap.importers import stage as importers
 from smust3r_colmap.refinement import stage as refinement
 from smust3r_colmap.report import summarise as report
+from smust3r_colmap.report.html import write_report
 from smust3r_colmap.report.summary import RunSummary
 from smust3r_colmap.segmentation import stage as segmentation
 from smust3r_colmap.stitching import stage as stitching
@@ -77,4 +78,6 @@ def reconstruct(
         outputs = exporters.export(
             run, fused, refined, initial, source.folder, collection, config, before=stitched.before
         )
-        return report.reconstruction(run, collection, segments, submodels, edges, stitched, refined, fused, outputs)
+        summary = report.reconstruction(run, collection, segments, submodels, edges, stitched, refined, fused, outputs)
+        write_report(run, source.folder, config.output)
+        return summary

@@ -27,6 +27,7 @@ from smust3r_colmap.importers import stage as importers
 from smust3r_colmap.importers.colmap_model import read_colmap_model
 from smust3r_colmap.refinement import stage as refinement
 from smust3r_colmap.report import summarise as report
+from smust3r_colmap.report.html import write_report
 from smust3r_colmap.report.summary import RunSummary
 
 
@@ -72,4 +73,6 @@ def refine_model(
         )
         fused = fuse_external(run, start, fitted.untracked_points, refined)
         outputs = exporters.export(run, (fused,), refined, initial, images, fitted.collection, config, before={})
-        return report.refined_model(run, fitted, features, refined, fused, outputs, config)
+        summary = report.refined_model(run, fitted, features, refined, fused, outputs, config)
+        write_report(run, images, config.output)
+        return summary

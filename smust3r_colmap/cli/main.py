@@ -29,6 +29,7 @@ from smust3r_colmap.cli.frames import Frames, run_frames
 from smust3r_colmap.cli.presets import PRESETS
 from smust3r_colmap.cli.reconstruct import Reconstruct, run_reconstruct
 from smust3r_colmap.cli.refine import Refine, run_refine
+from smust3r_colmap.cli.report import Report, run_report
 from smust3r_colmap.cli.validate import Validate, run_validate
 from smust3r_colmap.cli.weights import WeightsCommand, run_weights
 from smust3r_colmap.config import RefineConfig, RunConfig
@@ -41,9 +42,9 @@ _DESCRIPTION = """Offline structure from motion for COLMAP workflows, segment by
 Exit codes: 0 good, 1 failed, 2 wrong use, 3 finished with warnings, 130 interrupted.
 --version prints the version."""
 
-Command = Reconstruct | Refine | Frames | Export | Validate | Evaluate | Demo | Doctor | WeightsCommand
+Command = Reconstruct | Refine | Frames | Export | Report | Validate | Evaluate | Demo | Doctor | WeightsCommand
 
-COMMANDS = ("reconstruct", "refine", "frames", "export", "validate", "evaluate", "demo", "doctor", "weights")
+COMMANDS = ("reconstruct", "refine", "frames", "export", "report", "validate", "evaluate", "demo", "doctor", "weights")
 SETTINGS = {"reconstruct": RunConfig, "refine": RefineConfig}
 """The commands that take a settings file, and what it may hold."""
 
@@ -127,6 +128,8 @@ def _run(command: Command) -> int:  # noqa: PLR0911  (one return per command)
             return run_frames(command)
         case Export():
             return run_export(command)
+        case Report():
+            return run_report(command)
         case Validate():
             return run_validate(command)
         case Evaluate():

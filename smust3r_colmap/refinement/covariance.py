@@ -11,7 +11,7 @@ The next module to read is ``links``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -77,8 +77,7 @@ def pose_covariance(
     group = max(1, -(-n // max_nodes))
     body_of = np.arange(n) // group
     bases, width = _bases(linear.centres, body_of, group)
-    own, mixed, coupling = _eliminated(linear, bases, body_of, width)
-    information = np.asarray(mixed - (coupling @ coupling.T).toarray()) / linear.noise_px**2
+    own, information = _eliminated(linear, bases, body_of, width)
     size = width * (int(body_of[-1]) + 1)
     of_body = 1 / np.repeat([centre_sigma, UNBOUNDED], [3, width - 3]) ** 2
     priors = [np.tile(of_body, size // width), _distortion_priors(linear, calibrated=calibrated)]
@@ -86,12 +85,42 @@ def pose_covariance(
     factor = cho_factor(information, lower=True, overwrite_a=True, check_finite=False)
     wanted = np.eye(len(information), size)
     covariance = cho_solve(factor, wanted, overwrite_b=True, check_finite=False)[:size]
-    alone = np.asarray(np.linalg.inv(own / linear.noise_px**2 + np.eye(6) / UNBOUNDED**2), dtype=np.float64)
+    alone = np.asarray(np.linalg.inv(own + np.eye(6) / UNBOUNDED**2), dtype=np.float64)
     held = _sigma(alone[:, :3, :3]) < UNBOUNDED
     blocks = _aligned_blocks(linear.centres, held, covariance, bases, body_of, width)
     if group > 1:
         blocks = blocks + alone
     return PoseCovariance(blocks=blocks)
+
+
+def parameter_covariance(linear: LinearisedModel, *, max_nodes: int = MAX_NODES) -> FloatArray:
+    """(C K, C K) covariance of the K camera parameters of each of C cameras, all poses and points being unknown.
+
+    Args:
+        linear: its ``by_distortion`` is (M, 2, K), the Jacobian by the parameters of the camera of each observation;
+            zero in columns that a camera has no parameter for, whose covariance means nothing.
+        max_nodes: see the module.
+    """
+    n = len(linear)
+    group = max(1, -(-n // max_nodes))
+    body_of = np.arange(n) // group
+    sizes = np.sqrt((linear.by_distortion**2).sum(axis=(0, 1)))
+    units = np.where(sizes > 0, 1 / np.where(sizes > 0, sizes, 1), 1)  # so that focal lengths and distortions are alike
+    bases, width = _bases(linear.centres, body_of, group)
+    scaled = replace(linear, by_distortion=linear.by_distortion * units)
+    _, information = _eliminated(scaled, bases, body_of, width)
+    size = width * (int(body_of[-1]) + 1)
+    information[np.arange(size), np.arange(size)] += 1 / UNBOUNDED**2
+    diagonal = np.diagonal(information)[size:]
+    information[np.arange(size, len(information)), np.arange(size, len(information))] += np.where(
+        diagonal > 0, 1e-12 * diagonal, 1
+    )
+    coupling = information[:size, size:]
+    factor = cho_factor(information[:size, :size], lower=True, check_finite=False)
+    reduced = information[size:, size:] - coupling.T @ cho_solve(factor, coupling, check_finite=False)
+    every = np.tile(units, linear.num_cameras)
+    covariance: FloatArray = np.linalg.inv((reduced + reduced.T) / 2) * np.outer(every, every)
+    return covariance
 
 
 def _bases(centres: FloatArray, body_of: IntArray, group: int) -> tuple[FloatArray, int]:
@@ -105,28 +134,27 @@ def _bases(centres: FloatArray, body_of: IntArray, group: int) -> tuple[FloatArr
 
 def _eliminated(
     linear: LinearisedModel, bases: FloatArray, body_of: IntArray, width: int
-) -> tuple[FloatArray, FloatArray, csr_array]:
-    """Normal equations with points eliminated, as ``mixed - coupling coupling^T``; pixels have unit variance.
+) -> tuple[FloatArray, FloatArray]:
+    """Normal equations with points eliminated.
 
     Returns:
-        (N, 6, 6) information of each pose, all else fixed; (D, D) of bodies and distortions, points fixed; and the
-        (D, 3P) sparse coupling with the points, whitened by their information.
+        (N, 6, 6) information of each pose, all else fixed; (D, D) of bodies and distortions, points being unknown.
     """
     root = np.sqrt(linear.weights)[:, None, None]
     by_point = linear.by_point * root
     by_pose, by_distortion = linear.by_pose * root, linear.by_distortion * root
     num_bodies = int(body_of[-1]) + 1
-    first = width * num_bodies
+    first, num_distortions = width * num_bodies, by_distortion.shape[2]
     columns = np.concatenate([by_pose @ bases[linear.image_of], by_distortion], axis=2)
     bodies, cameras = body_of[linear.image_of], linear.cameras[linear.image_of]
     rows = np.concatenate(
         [
             width * bodies[:, None] + np.arange(width),
-            first + NUM_DISTORTIONS * cameras[:, None] + np.arange(NUM_DISTORTIONS),
+            first + num_distortions * cameras[:, None] + np.arange(num_distortions),
         ],
         axis=1,
     )
-    size = first + NUM_DISTORTIONS * linear.num_cameras
+    size = first + num_distortions * linear.num_cameras
     own, mixed = np.zeros((len(linear), 6, 6)), np.zeros((size, size))
     ends = np.searchsorted(linear.image_of, np.arange(len(linear) + 1))
     for image, (start, end) in enumerate(pairwise(ends.tolist())):
@@ -142,7 +170,8 @@ def _eliminated(
         (crossed.ravel(), (np.broadcast_to(rows[:, :, None], crossed.shape).ravel(), at.ravel())),
         shape=(size, 3 * len(linear.points)),
     )
-    return own, mixed, coupling
+    information = np.asarray(mixed - (coupling @ coupling.T).toarray())
+    return own / linear.noise_px**2, information / linear.noise_px**2
 
 
 def _whitening(by_point: FloatArray, point_of: IntArray, num_points: int) -> FloatArray:

@@ -72,6 +72,17 @@ def find_misregistered(support: Mapping[Pair, EpipolarSupport], images: Collecti
     return tuple(sorted(i for cluster in contradicted - {largest} for i in clusters.members[cluster]))
 
 
+def consistent_groups(support: Mapping[Pair, EpipolarSupport], images: Collection[int]) -> tuple[tuple[int, ...], ...]:
+    """The images in groups that agree with each other, see the module; the largest first.
+
+    Args:
+        support, images: as in ``find_misregistered``.
+    """
+    clusters = _cluster({pair: found.weight for pair, found in support.items() if found.weight}, images)
+    groups = [tuple(sorted(members)) for members in clusters.members.values()]
+    return tuple(sorted(groups, key=lambda group: (-len(group), group)))
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Connection:
     """Between two clusters: the sum of the weights, and how many pairs support it."""

@@ -32,6 +32,8 @@ from smust3r_colmap.stitching.stage import (
 from smust3r_colmap.storage.run_directory import write_json
 
 SUMMARY_FILE = "summary.json"
+SEGMENTS_FILE = "segments.json"
+"""In ``work``: image indices of each window or cluster."""
 
 
 def reconstruction(
@@ -79,6 +81,7 @@ def reconstruction(
         missing_outputs=outputs.missing,
         notes=outputs.notes,
     )
+    write_json(run.folder.work / SEGMENTS_FILE, [window.images for window in segments.windows])
     return _written(run, summary, {})
 
 

@@ -8,7 +8,7 @@
       dense/               COLMAP's workspace of depth and normal maps, fused.ply
       trajectory_tum.txt  trajectory_stitched_tum.txt  trajectory_without_loops_tum.txt
       poses_uncertainty.csv
-      summary.json  config.toml
+      summary.json  config.toml  report.html
       work/
         lock               held by the process that writes
         native.log         messages of pycolmap's native code
@@ -22,6 +22,7 @@
         cover/             clusters of images in no order
         tokens/            images as the MUSt3R network encoded them; the least recently used give way
         segments/0000/     mapping/  calibrated/  depth_0/  depth_1/ ..., or the prediction of a network
+        segments.json      the images of each window or cluster, for the report
         alignment/         edges between the submodels
         stitched/          cameras as stitching placed them, one depth map per image
         track_pairs/       image pairs that the stitched geometry suggests for tracks
@@ -98,6 +99,7 @@ class RunDirectory:
         "dense",
         "summary.json",
         "config.toml",
+        "report.html",
     )
 
     def __init__(self, root: Path) -> None:

@@ -193,7 +193,7 @@ def test_an_unknown_command_exits_2_with_those_there_are(
     assert cli.main([typed, "photos"]) == 2
     assert capsys.readouterr().err == (
         f"smust3r-colmap: there is no command {typed!r}{meant}; "
-        "the commands are reconstruct, refine, frames, export, validate, evaluate, demo, doctor, weights\n"
+        "the commands are reconstruct, refine, frames, export, report, validate, evaluate, demo, doctor, weights\n"
     )
 
 
@@ -465,7 +465,7 @@ def test_what_most_people_need_comes_first(
 def test_the_docstrings_of_inherited_fields_are_found() -> None:
     docs = field_docs(OutputConfig)
     assert docs["text"] == "Write the COLMAP model as .txt beside the .bin files."
-    assert docs.keys() == {"text", "trainer", "trainer_scales", "dense", "mesh"}
+    assert docs.keys() == {"text", "trainer", "trainer_scales", "report", "dense", "mesh"}
 
 
 def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -169,7 +170,7 @@ def test_all_results_are_written(finished: RunSummary) -> None:
     names = {path.name for path in finished.output.iterdir()}
     assert names == {
         "sparse", "database.db", "trainer", "dense", "points.ply", "scene.glb", "trajectory_tum.txt",
-        "trajectory_stitched_tum.txt", "poses_uncertainty.csv", "summary.json", "config.toml", "work",
+        "trajectory_stitched_tum.txt", "poses_uncertainty.csv", "summary.json", "config.toml", "report.html", "work",
     }  # fmt: skip
     facts = json.loads((finished.output / "summary.json").read_text())
     assert facts["num_registered"] == NUM_IMAGES
@@ -259,6 +260,15 @@ def test_killed_in_the_middle_of_a_stage_it_goes_on_to_the_same_model(
     for name in ("images.bin", "points3D.bin", "cameras.bin"):
         found = (output / "sparse/0" / name).read_bytes()
         assert found == (brief.output / "sparse/0" / name).read_bytes(), name
+    assert report_without_cost(output) == report_without_cost(brief.output)
+
+
+def report_without_cost(output: Path) -> str:
+    """The page; of one start it says what it cost, and that is not the same twice, nor are the workers."""
+    page = (output / "report.html").read_text(encoding="utf-8")
+    without, num_costs = re.subn(r'<section id="cost">.*?</section>', "", page, flags=re.S)
+    assert num_costs == 1
+    return re.sub(r"^workers = .*$", "", without, flags=re.M)
 
 
 def _copy_of_finished_stages(source: Path, output: Path, stages: list[str]) -> list[str]:

@@ -12,6 +12,7 @@ from smust3r_colmap.refinement.misregistration import (
     MIN_CONTRADICTING_MATCHES,
     MIN_SUPPORTING_FRACTION,
     EpipolarSupport,
+    consistent_groups,
     find_misregistered,
 )
 
@@ -98,3 +99,12 @@ def test_without_a_majority_nothing_is_misregistered() -> None:
 
 def test_indices_of_the_collection_need_not_begin_at_zero() -> None:
     assert find_misregistered(support([(10, 12), (12, 17)], [(17, 30)]), [10, 12, 17, 30]) == (30,)
+
+
+def test_groups_that_contradict_each_other_are_found_the_largest_first() -> None:
+    found = consistent_groups(support(walk(range(4)) + walk(range(4, 10)), [(0, 5), (1, 6)]), range(11))
+    assert found == ((4, 5, 6, 7, 8, 9), (0, 1, 2, 3), (10,))
+
+
+def test_one_contradicting_pair_does_not_part_a_group() -> None:
+    assert consistent_groups(support(walk(range(10)), [(0, 9)]), range(10)) == (tuple(range(10)),)
