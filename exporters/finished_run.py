@@ -22,6 +22,7 @@ from smust3r_colmap.storage.depth_maps import depth_maps_of_run
 from smust3r_colmap.storage.digest import digest_of
 from smust3r_colmap.storage.run_directory import (
     DATABASE_FILE,
+    FINISHED_FILE,
     FORMAT_VERSION,
     IMPORT_STAGE,
     MODEL_FOLDER,
@@ -32,8 +33,6 @@ from smust3r_colmap.storage.run_directory import (
     storage_errors,
 )
 from smust3r_colmap.storage.scenes import FUSED_SCENES
-
-FINISHED_FILE = "finished.json"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -32,9 +32,9 @@ from smust3r_colmap.products import FusedScene, ImageCollection, Scene
 from smust3r_colmap.refinement.stage import InitialScenes, Refinement
 from smust3r_colmap.storage.atomic_write import atomic_file, atomic_folder, write_atomically
 from smust3r_colmap.storage.config_file import config_to_toml
+from smust3r_colmap.storage.run_directory import UNCERTAINTY_FILE
 
 TRAINER_FOLDER, DENSE_FOLDER, DATABASE_FILE = "trainer", "dense", "database.db"
-UNCERTAINTY_FILE = "poses_uncertainty.csv"
 _NAMES_SHOWN = 3
 
 

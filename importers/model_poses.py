@@ -14,10 +14,9 @@ from smust3r_colmap.geometry.sim3 import invert_rigid
 from smust3r_colmap.importers.colmap_model import by_frame, cam_from_world_of, refuse_twins, tidy_name
 from smust3r_colmap.importers.colmap_records import Fixes, holds_model, read_image_records
 from smust3r_colmap.importers.pose_set import PoseSet, text_of
+from smust3r_colmap.storage.run_directory import FINISHED_FILE
 
 logger = logging.getLogger(__name__)
-
-_FINISHED_FILE = "work/finished.json"
 
 
 def read_model_poses(folder: Path) -> dict[str, FloatArray]:
@@ -82,13 +81,13 @@ def _model_folders(path: Path) -> list[Path]:
 
 
 def _notes(run: Path) -> tuple[str, ...]:
-    is_finished = (run / _FINISHED_FILE).is_file()
+    is_finished = (run / "work" / FINISHED_FILE).is_file()
     return () if is_finished else (f"{run}: the run is not finished; its models may be those of an earlier start",)
 
 
 def _stamps_of_run(run: Path) -> dict[str, float]:
     """Seconds by name, of the images of a finished run that have a time."""
-    path = run / _FINISHED_FILE
+    path = run / "work" / FINISHED_FILE
     if not path.is_file():
         return {}
     try:

@@ -8,7 +8,6 @@ from pathlib import Path
 from smust3r_colmap.errors import InputError
 from smust3r_colmap.importers.pose_set import text_of
 
-UNCERTAINTY_FILE = "poses_uncertainty.csv"
 _COLUMNS = ("model", "image", "position_sigma")
 
 

@@ -98,7 +98,8 @@ def run_evaluate(command: Evaluate) -> int:
 
 def _sigmas(model: Path) -> dict[str, float] | None:
     """Predicted errors that lie beside the models of a run."""
-    from smust3r_colmap.importers.uncertainty_table import UNCERTAINTY_FILE, read_position_sigmas  # noqa: PLC0415
+    from smust3r_colmap.importers.uncertainty_table import read_position_sigmas  # noqa: PLC0415
+    from smust3r_colmap.storage.run_directory import UNCERTAINTY_FILE  # noqa: PLC0415
 
     table = model.parent.parent / UNCERTAINTY_FILE
     return read_position_sigmas(table, f"{model.parent.name}/{model.name}") if table.is_file() else None

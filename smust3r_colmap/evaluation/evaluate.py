@@ -7,7 +7,7 @@ is ``table``, which writes the rows.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -45,6 +45,7 @@ _SUSPECT_DEG, _SUSPECT_FACTOR = 5.0, 5.0
 """Orientations that are off by so much, and agree so many times better with the quaternion in another order."""
 
 Values = Mapping[str, float | None]
+_NO_STATISTICS: Values = dict.fromkeys(one.name for one in fields(Statistics))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +74,7 @@ class Row:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluation:
+class EvaluationReport:
     """All rows.
 
     Args:
@@ -120,7 +121,7 @@ def evaluate(
     sigmas: Mapping[str, float] | None = None,
     clouds: tuple[FloatArray, FloatArray] | None = None,
     workspace: DenseWorkspace | None = None,
-) -> Evaluation:
+) -> EvaluationReport:
     """Compare the first model with the reference; the others count in COLMAP's area under the curve only.
 
     Args:
@@ -155,7 +156,7 @@ def evaluate(
         *([] if clouds is None else _cloud(compared, *clouds)),
         *([] if workspace is None or reference.depth is None else _depth(compared, workspace, reference.depth)),
     ]
-    return Evaluation(
+    return EvaluationReport(
         estimate=_described(first),
         reference=_described(reference),
         rows=tuple(rows),
@@ -216,14 +217,14 @@ def _absolute(compared: _Compared) -> Iterator[Row]:
     angles = asdict(Statistics.of(rotation_errors_deg(compared.aligned, compared.reference)))
     yield compared.row(
         "aae",
-        dict.fromkeys(angles) if is_line else angles,
+        _NO_STATISTICS if is_line else angles,
         "deg",
         note="not determined: the centres are on a line" if is_line else "orientations after the fit of the centres",
     )
     try:
         turned = align_rotations(compared.estimated, compared.reference)
     except DegenerateAlignmentError as error:
-        yield compared.row("aae_rotation_aligned", dict.fromkeys(angles), "deg", "mean rotation", note=str(error))
+        yield compared.row("aae_rotation_aligned", _NO_STATISTICS, "deg", "mean rotation", note=str(error))
     else:
         errors_deg = rotation_errors_deg(turned, compared.reference)
         yield compared.row("aae_rotation_aligned", asdict(Statistics.of(errors_deg)), "deg", "mean rotation")
@@ -278,7 +279,8 @@ def _relative(compared: _Compared) -> Iterator[Row]:
     kind = "from every pose" if options.rpe_all_pairs else "one after the other"
     note = f"{len(pairs)} pairs of compared poses, {kind}; delta {options.rpe_delta:g} {options.rpe_unit}"
     if not len(pairs):
-        yield compared.row("rpe", {"rmse": None}, "", note=f"{note}: the path is too short")
+        for metric, unit in (("rpe_translation", compared.unit), ("rpe_rotation", "deg")):
+            yield compared.row(metric, _NO_STATISTICS, unit, note=f"{note}: the path is too short")
         return
     lengths, angles_deg = relative_errors(compared.aligned, compared.reference, pairs)
     yield compared.row("rpe_translation", asdict(Statistics.of(lengths)), compared.unit, note=note)
@@ -304,44 +306,42 @@ def _pairs(
 ) -> Iterator[Row]:
     n = len(compared.reference)
     if n > _MAX_IMAGES_IN_PAIRS:
-        yield compared.row(
-            "auc", {"1": None}, "%", "none", note=f"more than {_MAX_IMAGES_IN_PAIRS} poses: not computed"
-        )
+        for metric, thresholds in (("auc_colmap_compared", COLMAP_THRESHOLDS_DEG), ("auc_vggt", VGGT_THRESHOLDS_DEG)):
+            nothing = _by_threshold(thresholds, [None] * len(thresholds))
+            yield compared.row(metric, nothing, "%", "none", note=f"not computed: {n} poses have too many pairs")
         return
     accuracy = compared.options.reference_accuracy
     alone = auc_colmap(
         [(compared.estimated, compared.reference, 0)], n, n * (n - 1), COLMAP_THRESHOLDS_DEG, accuracy=accuracy
     )
     if associations[0].by_name:
-        parts = [
-            (model.world_from_cam[one.estimate], reference.world_from_cam[one.reference], len(model) - len(one))
-            for model, one in zip(models, associations, strict=False)
-        ]
-        joined = _num_joined(associations, len(reference))
-        whole = auc_colmap(parts, len(reference), joined, COLMAP_THRESHOLDS_DEG, accuracy=accuracy)
         missing = len(reference) - len(np.unique(np.concatenate([one.reference for one in associations])))
-        unknown = sum(part[2] for part in parts)
-        yield compared.row(
-            "auc_colmap",
-            _by_threshold(COLMAP_THRESHOLDS_DEG, whole),
-            "%",
-            "none",
-            note=f"{missing} images of the reference have no pose and {unknown} of the estimate are unknown to it: all "
+        unknown = sum(len(model) - len(one) for model, one in zip(models, associations, strict=True))
+        note = (
+            f"{missing} images of the reference have no pose and {unknown} of the estimate are unknown to it: all "
             "their pairs count as 180 deg"
-            if missing or unknown
-            else "",
         )
+        is_alone = not (missing or unknown or len(models) > 1)
+        whole = alone if is_alone else _auc_of_all(models, reference, associations, accuracy)
+        values = _by_threshold(COLMAP_THRESHOLDS_DEG, whole)
+        yield compared.row("auc_colmap", values, "%", "none", note="" if is_alone else note)
     yield compared.row("auc_colmap_compared", _by_threshold(COLMAP_THRESHOLDS_DEG, alone), "%", "none")
-    yield compared.row(
-        "auc_vggt",
-        _by_threshold(VGGT_THRESHOLDS_DEG, auc_vggt(compared.estimated, compared.reference, VGGT_THRESHOLDS_DEG)),
-        "%",
-        "none",
-        note="compared poses only",
-    )
+    vggt = auc_vggt(compared.estimated, compared.reference, VGGT_THRESHOLDS_DEG)
+    yield compared.row("auc_vggt", _by_threshold(VGGT_THRESHOLDS_DEG, vggt), "%", "none", note="compared poses only")
 
 
-def _by_threshold(thresholds: Sequence[int], values: Sequence[float]) -> Values:
+def _auc_of_all(
+    models: Sequence[PoseSet], reference: PoseSet, associations: Sequence[Association], accuracy: float
+) -> tuple[float, ...]:
+    parts = [
+        (model.world_from_cam[one.estimate], reference.world_from_cam[one.reference], len(model) - len(one))
+        for model, one in zip(models, associations, strict=True)
+    ]
+    joined = _num_joined(associations, len(reference))
+    return auc_colmap(parts, len(reference), joined, COLMAP_THRESHOLDS_DEG, accuracy=accuracy)
+
+
+def _by_threshold(thresholds: Sequence[int], values: Sequence[float | None]) -> Values:
     return {f"at_{threshold}_deg": value for threshold, value in zip(thresholds, values, strict=True)}
 
 

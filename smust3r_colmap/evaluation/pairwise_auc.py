@@ -20,6 +20,7 @@ The next module to read is ``cloud_error``.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -52,15 +53,17 @@ def auc_colmap(
 
     Source: COLMAP, ``benchmark/reconstruction/evaluation/utils.py`` (``compute_grouped_rel_errors``, ``compute_auc``).
     """
-    limit = max(thresholds_deg)
-    num_wrong = num_reference * (num_reference - 1) - num_joined
-    kept, num_pairs = [], num_wrong
+    areas = [_Area(threshold_deg=threshold, flat_deg=accuracy) for threshold in thresholds_deg]
+    num_pairs = num_reference * (num_reference - 1) - num_joined
     for estimated, reference, num_unknown in models:
         n = len(estimated)
         num_pairs += n * (n - 1) + num_unknown * (num_unknown + 2 * n - 1)
-        kept += [_below(_errors_from(k, estimated, reference, accuracy), limit) for k in range(n)]
-    errors_deg = np.sort(np.concatenate([np.empty(0), *kept]))
-    return tuple(100 * _area_below(errors_deg, num_pairs, threshold, accuracy) for threshold in thresholds_deg)
+        pairs = _Pairs.of(estimated, reference)
+        for k in range(n):
+            errors_deg = _errors_from(k, pairs, accuracy)
+            for area in areas:
+                area.add(errors_deg)
+    return tuple(100 * area.share(num_pairs) for area in areas)
 
 
 def auc_vggt(estimated: FloatArray, reference: FloatArray, thresholds_deg: Sequence[int]) -> tuple[float, ...]:
@@ -68,11 +71,11 @@ def auc_vggt(estimated: FloatArray, reference: FloatArray, thresholds_deg: Seque
 
     Source: VGGT, ``evaluation/test_co3d.py`` (``se3_to_relative_pose_error``, ``calculate_auc_np``).
     """
-    n = len(estimated)
+    n, pairs = len(estimated), _Pairs.of(estimated, reference)
     counts = {threshold: np.zeros(threshold, dtype=np.int64) for threshold in thresholds_deg}
     for k in range(n - 1):
         rows = np.arange(k + 1, n)
-        rotation_deg, direction_deg = _pair_errors_deg(k, rows, estimated, reference)
+        rotation_deg, direction_deg = pairs.errors_deg(k, rows)
         errors_deg = np.maximum(rotation_deg, np.minimum(direction_deg, 180 - direction_deg))
         for threshold in counts:  # the last bin has its end
             counts[threshold] += np.histogram(errors_deg, bins=np.arange(threshold + 1))[0]
@@ -80,29 +83,44 @@ def auc_vggt(estimated: FloatArray, reference: FloatArray, thresholds_deg: Seque
     return tuple(100 * float(np.cumsum(count).mean() / num_pairs) for count in counts.values())
 
 
-def _errors_from(k: int, estimated: FloatArray, reference: FloatArray, accuracy: float) -> FloatArray:
+def _errors_from(k: int, pairs: _Pairs, accuracy: float) -> FloatArray:
     """(N - 1,) of the ordered pairs that begin at row k."""
-    rows = np.delete(np.arange(len(estimated)), k)
-    rotation_deg, direction_deg = _pair_errors_deg(k, rows, estimated, reference)
-    is_short = np.linalg.norm(reference[rows, :, 3] - reference[k, :, 3], axis=1) < accuracy
+    rows = np.delete(np.arange(len(pairs.turns)), k)
+    rotation_deg, direction_deg = pairs.errors_deg(k, rows)
+    is_short = np.linalg.norm(pairs.reference[rows] - pairs.reference[k], axis=1) < accuracy
     return np.maximum(rotation_deg, np.where(is_short, 0.0, direction_deg))
 
 
-def _pair_errors_deg(
-    k: int, rows: IntArray, estimated: FloatArray, reference: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Angles between the rotations, and between the translations, of ``cam_k_from_cam_row``."""
-    motions = []
-    for poses in (estimated, reference):
-        k_from_world = poses[k, :, :3].T
-        shift = (poses[rows, :, 3] - poses[k, :, 3]) @ k_from_world.T
-        motions.append((k_from_world @ poses[rows, :, :3], shift))
-    (rotation_est, shift_est), (rotation_ref, shift_ref) = motions
-    cosines = (_directions(shift_est) * _directions(shift_ref)).sum(axis=1)
-    return (
-        np.rad2deg(angles_between(rotation_est, rotation_ref)),
-        np.rad2deg(np.arccos(cosines.clip(-1, 1))),
-    )
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Pairs:
+    """What the errors of all pairs are made of.
+
+    With D = R_estimate R_reference^T of a camera, the relative rotations of a pair differ by D_k^T D_j, turned; and a
+    direction of the reference, seen by camera k, is D_k times it in the world of the estimate.
+
+    Args:
+        turns: (N, 3, 3) D. estimate, reference: (N, 3) centres.
+    """
+
+    turns: FloatArray
+    estimate: FloatArray
+    reference: FloatArray
+
+    @classmethod
+    def of(cls, estimated: FloatArray, reference: FloatArray) -> _Pairs:
+        """Of poses (N, 3, 4)."""
+        turns = estimated[:, :, :3] @ np.swapaxes(reference[:, :, :3], 1, 2)
+        return cls(turns=turns, estimate=estimated[:, :, 3], reference=reference[:, :, 3])
+
+    def errors_deg(self, k: int, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Angles between the rotations, and between the translations, of ``cam_k_from_cam_row``."""
+        directions_est = _directions(self.estimate[rows] - self.estimate[k])
+        directions_ref = _directions(self.reference[rows] - self.reference[k]) @ self.turns[k].T
+        cosines = (directions_est * directions_ref).sum(axis=1)
+        return (
+            np.rad2deg(angles_between(self.turns[rows], self.turns[k])),
+            np.rad2deg(np.arccos(cosines.clip(-1, 1))),
+        )
 
 
 def _directions(vectors: FloatArray) -> FloatArray:
@@ -111,15 +129,36 @@ def _directions(vectors: FloatArray) -> FloatArray:
     return directions
 
 
-def _below(errors_deg: FloatArray, limit_deg: float) -> FloatArray:
-    return errors_deg[errors_deg <= limit_deg]
+@dataclass(kw_only=True)
+class _Area:
+    """The area under the recall up to a threshold, from errors in any order.
 
+    The recall rises by one pair at each error e_i, linearly from the error before, and stays at the last value. With m
+    errors up to the threshold t the trapezoids add up to ``t m - sum(e_i) + e_m / 2``. Below ``flat_deg`` the recall is
+    that of all errors up to it: they count as 0, and the first line begins there, which takes ``flat_deg / 2`` away.
+    """
 
-def _area_below(errors_deg: FloatArray, num_pairs: int, threshold_deg: float, flat_deg: float) -> float:
-    """Area under the recall from 0 to the threshold, over the threshold; the recall is linear between errors (M,)."""
-    count = int(np.searchsorted(errors_deg, threshold_deg, side="right"))
-    num_flat = int(np.searchsorted(errors_deg, flat_deg, side="right")) if flat_deg > 0 else 0
-    start, recall_at_start = ([0.0, flat_deg], [num_flat, num_flat]) if flat_deg > 0 else ([0.0], [0])
-    x = np.concatenate([start, errors_deg[num_flat:count], [threshold_deg]])
-    y = np.concatenate([recall_at_start, np.arange(num_flat, count) + 1, [count]]) / num_pairs
-    return float(np.sum((x[1:] - x[:-1]) * (y[1:] + y[:-1]) / 2) / threshold_deg)
+    threshold_deg: float
+    flat_deg: float
+    num_flat: int = 0
+    num_below: int = 0
+    sum_deg: float = 0.0
+    last_deg: float = 0.0
+
+    def add(self, errors_deg: FloatArray) -> None:
+        """More pairs."""
+        if self.flat_deg > 0:
+            self.num_flat += int((errors_deg <= self.flat_deg).sum())
+        below = errors_deg[errors_deg <= self.threshold_deg]
+        rising = below[below > self.flat_deg] if self.flat_deg > 0 else below
+        self.num_below += len(below)
+        self.sum_deg += float(rising.sum())
+        self.last_deg = max(self.last_deg, float(rising.max(initial=0.0)))
+
+    def share(self, num_pairs: int) -> float:
+        """Over the threshold and all pairs, those without an error too."""
+        if self.flat_deg >= self.threshold_deg:
+            return self.num_flat / num_pairs
+        corner_deg = (max(self.last_deg, self.flat_deg) - self.flat_deg) / 2
+        area = self.threshold_deg * self.num_below - self.sum_deg + corner_deg
+        return area / (self.threshold_deg * num_pairs)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, fields
 
 from smust3r_colmap.evaluation.absolute_error import Statistics
-from smust3r_colmap.evaluation.evaluate import Evaluation, Row
+from smust3r_colmap.evaluation.evaluate import EvaluationReport, Row
 
 _STATISTICS = tuple(one.name for one in fields(Statistics))
 _CSV_COLUMNS = (
@@ -26,7 +26,7 @@ _CSV_COLUMNS = (
 )
 
 
-def render_text(evaluation: Evaluation) -> str:
+def render_text(evaluation: EvaluationReport) -> str:
     """Two tables: errors with their statistics, and all other figures."""
     with_statistics = [row for row in evaluation.rows if tuple(row.values) == _STATISTICS]
     others = [row for row in evaluation.rows if tuple(row.values) != _STATISTICS]
@@ -44,12 +44,12 @@ def render_text(evaluation: Evaluation) -> str:
     return "\n".join([*lines, *evaluation.notes])
 
 
-def render_json(evaluation: Evaluation) -> str:
+def render_json(evaluation: EvaluationReport) -> str:
     """An object; a figure that is not determined is null."""
     return json.dumps(asdict(evaluation), indent=1) + "\n"
 
 
-def render_csv(evaluation: Evaluation) -> str:
+def render_csv(evaluation: EvaluationReport) -> str:
     """One line per figure; the value of one that is not determined is empty."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

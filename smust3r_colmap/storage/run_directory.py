@@ -63,6 +63,10 @@ CARRIED_DEPTH_STAGE = "carried_depth"
 """Folders below ``work`` that are read again when a finished run is exported."""
 FRAMES_STAGE = "frames"
 """Below ``work``: for each set of videos a folder of images."""
+FINISHED_FILE = "finished.json"
+"""Below ``work``: when all stages stand, which of them belong together."""
+UNCERTAINTY_FILE = "poses_uncertainty.csv"
+"""Among the results."""
 MODEL_FOLDER, DATABASE_FILE = "model", "database.db"
 """Of the refinement: the model of each scene, and the database that goes with all of them."""
 
@@ -93,7 +97,7 @@ class RunDirectory:
         "trajectory_tum.txt",
         "trajectory_without_loops_tum.txt",
         "trajectory_stitched_tum.txt",
-        "poses_uncertainty.csv",
+        UNCERTAINTY_FILE,
         "database.db",
         "trainer",
         "dense",

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.config import EvaluateConfig
 from smust3r_colmap.errors import DegenerateAlignmentError
-from smust3r_colmap.evaluation.evaluate import Evaluation, Row, evaluate
+from smust3r_colmap.evaluation.evaluate import EvaluationReport, Row, evaluate
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.sim3 import Sim3
 from smust3r_colmap.importers.pose_set import PoseSet
@@ -41,12 +41,12 @@ def pose_set(
     )
 
 
-def row(evaluation: Evaluation, metric: str) -> Row:
+def row(evaluation: EvaluationReport, metric: str) -> Row:
     (found,) = [one for one in evaluation.rows if one.metric == metric]
     return found
 
 
-def value(evaluation: Evaluation, metric: str, statistic: str) -> float:
+def value(evaluation: EvaluationReport, metric: str, statistic: str) -> float:
     found = row(evaluation, metric).values[statistic]
     assert found is not None
     return found
@@ -221,7 +221,9 @@ def test_what_the_readers_noted_is_a_warning_and_a_model_as_reference_a_note() -
 
 def test_a_step_longer_than_the_path_has_no_figure() -> None:
     found = evaluate([pose_set()], pose_set(), EvaluateConfig(rpe_delta=12))
-    assert row(found, "rpe").values == {"rmse": None}
+    for metric in ("rpe_translation", "rpe_rotation"):
+        assert set(row(found, metric).values.values()) == {None}
+        assert "0 pairs" in row(found, metric).note
 
 
 COLMAP_AUC = {
@@ -251,3 +253,10 @@ def test_pairs_count_as_in_colmaps_own_benchmark() -> None:
     for accuracy, expected in COLMAP_AUC.items():
         found = evaluate(models, reference, EvaluateConfig(reference_accuracy=accuracy))
         assert list(row(found, "auc_colmap").values.values()) == pytest.approx(expected, abs=1e-6)
+
+
+def test_too_many_poses_for_all_pairs_have_no_area(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("smust3r_colmap.evaluation.evaluate._MAX_IMAGES_IN_PAIRS", 11)
+    found = evaluate([pose_set()], pose_set(), EvaluateConfig())
+    assert set(row(found, "auc_vggt").values.values()) == {None}
+    assert "12 poses have too many pairs" in row(found, "auc_colmap_compared").note

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smust3r_colmap.config import EvaluateConfig
-from smust3r_colmap.evaluation.evaluate import Evaluation, evaluate
+from smust3r_colmap.evaluation.evaluate import EvaluationReport, evaluate
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.importers.pose_layouts import read_pose_sets
 
@@ -52,7 +52,7 @@ def walks(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return folder / "estimate.txt", folder / "truth.txt"
 
 
-def ours(walks: tuple[Path, Path], **options: object) -> Evaluation:
+def ours(walks: tuple[Path, Path], **options: object) -> EvaluationReport:
     (estimate,), (truth,) = (read_pose_sets(path) for path in walks)
     return evaluate([estimate], truth, EvaluateConfig(**options))  # type: ignore[arg-type]
 
@@ -66,7 +66,7 @@ def theirs(walks: tuple[Path, Path], align: str) -> tuple[PoseTrajectory3D, Pose
     return truth, estimate
 
 
-def assert_same(evaluation: Evaluation, metric: str, statistics: dict[str, float]) -> None:
+def assert_same(evaluation: EvaluationReport, metric: str, statistics: dict[str, float]) -> None:
     (row,) = [row for row in evaluation.rows if row.metric == metric]
     for name, value in row.values.items():
         assert value == pytest.approx(statistics[name], abs=TOLERANCE, rel=TOLERANCE), (metric, name)

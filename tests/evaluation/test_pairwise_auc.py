@@ -70,6 +70,13 @@ def test_the_recall_is_flat_up_to_the_accuracy() -> None:
     assert found == pytest.approx(100 * (0.5 / 3 + 1.5 * (1 / 3 + 1 / 2) / 2 + 2) / 4, abs=1e-5)
 
 
+def test_below_the_accuracy_the_recall_is_that_of_all_errors_up_to_it() -> None:
+    """2 of 6 pairs are right, 4 are 2 deg off; with an accuracy of 2.5 all of them count as right."""
+    models = [(poses(turns_deg=(0, 0, 2)), poses(), 0)]
+    assert auc_colmap(models, 3, 6, (1,), accuracy=1.5) == pytest.approx((100 / 3,))
+    assert auc_colmap(models, 3, 6, (1,), accuracy=2.5) == pytest.approx((100,))
+
+
 def test_images_without_a_pose_and_unknown_ones_are_wrong() -> None:
     """Three of four images of the reference, and one that it lacks.
 

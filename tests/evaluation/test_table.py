@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 
-from smust3r_colmap.evaluation.evaluate import Evaluation, Row
+from smust3r_colmap.evaluation.evaluate import EvaluationReport, Row
 from smust3r_colmap.evaluation.table import render_csv, render_json, render_text
 
 STATISTICS = {"rmse": 0.123456, "mean": 0.1, "median": 0.09, "std": 0.01, "min": 0.0, "max": 1.0}
@@ -26,7 +26,7 @@ def row(metric: str, values: dict[str, float | None], unit: str = "m", note: str
     )
 
 
-FOUND = Evaluation(
+FOUND = EvaluationReport(
     estimate="out/sparse/0 (run, 10 poses)",
     reference="truth.txt (TUM trajectory, 12 poses)",
     rows=(
