@@ -253,22 +253,18 @@ def facts_of_model(folder: Path, images: Path | None, database: Path | None) -> 
     checked = read_colmap_model(folder)
     model = _read_model(checked.folder)
     name = "/".join(checked.folder.absolute().parts[-2:])
-    note = (
-        "" if database is not None else "no database was given (--database), so nothing outside of its tracks is known"
-    )
+    note = "" if database is not None else "what matches say is not known without the database (--database)"
     facts = _model_facts(name, model, database=database, note=note, calibrated=False, stored=None, has_uncertainty=True)
-    assert facts.uncertainty is not None, "asked for"
-    about = summarise_uncertainty(facts.uncertainty)
+    about = None if facts.uncertainty is None else summarise_uncertainty(facts.uncertainty)
     found = sorted(_reasons_about_model(name, facts, about), key=lambda reason: -reason.weight)
-    states: dict[str, tuple[int, str]] = {
-        name: (FEW, "")
-        for name, count in zip(facts.names, facts.observed.num_observations, strict=True)
-        if count < FEW_OBSERVATIONS
-    }
-    states |= dict.fromkeys(about.undetermined, (UNDETERMINED, ""))
-    states |= dict.fromkeys(about.contradicted, (CONTRADICTED, ""))
+    states: dict[str, tuple[int, str]] = {}
+    if about is not None:
+        counts = zip(facts.names, facts.observed.num_observations, strict=True)
+        states |= {name: (FEW, "") for name, count in counts if count < FEW_OBSERVATIONS}
+        states |= dict.fromkeys(about.undetermined, (UNDETERMINED, ""))
+        states |= dict.fromkeys(about.contradicted, (CONTRADICTED, ""))
     states |= {one.name: (NO_POSE, one.reason) for one in checked.unposed}
-    failed = about.predicted_error_percent >= FAILED_PERCENT
+    failed = about is not None and about.predicted_error_percent >= FAILED_PERCENT
     level: Level = "failed" if failed else "weak" if found else "good"
     return ReportFacts(
         what=f"{len(facts.names)} images",
@@ -283,9 +279,16 @@ def facts_of_model(folder: Path, images: Path | None, database: Path | None) -> 
     )
 
 
-def _reasons_about_model(name: str, facts: ModelFacts, about: UncertaintySummary) -> Iterator[Reason]:
+def _reasons_about_model(name: str, facts: ModelFacts, about: UncertaintySummary | None) -> Iterator[Reason]:
     """As those of a run, and the groups that contradict each other where none of them has most images."""
-    yield from reasons_about(name, about, 1.0)
+    if about is None:
+        yield Reason(
+            text=f"{name}: has no tracks, so its residuals and uncertainties are not known",
+            advice="give its points, or refine it",
+            weight=1.0,
+        )
+    else:
+        yield from reasons_about(name, about, 1.0)
     if facts.agreement is not None and facts.agreement.is_split:
         sizes = [len(group.rows) for group in facts.agreement.groups]
         yield Reason(
@@ -323,13 +326,14 @@ def _model_facts(
         else:
             note = f"{database.name} has no verified matches of the images of this model"
     axes = plan_axes(observed.centres, observed.down)
+    is_measured = has_uncertainty and len(observed.image_of) > 0
     return ModelFacts(
         folder=folder,
         names=names,
         observed=observed,
         cameras=camera_facts(model, observed, calibrated=calibrated, at_most=MAX_CAMERAS),
         num_cameras=len({model.image(i).camera_id for i in observed.image_ids}),
-        uncertainty=_uncertainty(model, agreement, stored, calibrated=calibrated) if has_uncertainty else None,
+        uncertainty=_uncertainty(model, agreement, stored, calibrated=calibrated) if is_measured else None,
         agreement=agreement,
         agreement_note=note,
         paths=(Path2D(title=RESULT, rows=tuple(range(len(names))), xy=observed.centres @ axes.T),),
@@ -400,9 +404,7 @@ def _thumbnails(state_of: Mapping[str, tuple[int, str]], folder: Path | None) ->
     made, problem = make_thumbnails(list(paths.values()), workers=usable_cores())
     notes = []
     if len(chosen) < len(usable):
-        notes.append(
-            f"{len(chosen)} of {len(usable)} images have a thumbnail: all with a problem first, then every nth"
-        )
+        notes.append(f"{len(chosen)} of {len(usable)} images have a thumbnail, those with a problem first")
     if problem:
         notes.append(f"images without a thumbnail: {problem}")
     return {name: made[path] for name, path in paths.items() if path in made}, "; ".join(notes)

@@ -20,8 +20,9 @@ MIN_IN_CELL = 20
 MAX_ANGLE_POINTS = 20_000
 MAX_ANGLE_VIEWS = 24
 """Points whose triangulation angle is measured, and views of each; more are thinned evenly."""
-MAX_UNCERTAIN_IMAGES = 3000
-"""Images of a model whose intrinsics are given standard deviations; for more it takes longer than a report may."""
+MAX_UNCERTAIN_IMAGES, MAX_UNCERTAIN_PARAMETERS = 1000, 1200
+"""Images of a model, and parameters of all its cameras, up to which these get standard deviations: beyond, it takes
+longer and more memory than a report may."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -125,8 +126,9 @@ class CameraFacts:
     """One camera of a model.
 
     Args:
-        names, values: of its parameters. sigmas: their standard deviations, NaN for those that were fixed.
-        free: positions of the others. correlation: (F, F) between them.
+        names, values: of its parameters. free: positions of those that were adjusted.
+        sigmas: standard deviations of all parameters, NaN where they are fixed or not known.
+        correlation: (F, F) between those that were adjusted; empty where it is not known.
         mean_residuals_px: (R, C, 2) by cell of the image, NaN for few observations. num_in_cell: (R, C).
     """
 
@@ -167,9 +169,9 @@ def camera_facts(
         )
         sigmas = np.full(len(camera.params), np.nan)
         covariance = covariances.get(one, np.zeros((0, 0)))
-        known = free[one] if len(covariance) else ()
-        sigmas[list(known)] = np.sqrt(np.diag(covariance))
         scale = np.sqrt(np.diag(covariance))
+        if len(scale):
+            sigmas[list(free[one])] = scale
         facts.append(
             CameraFacts(
                 camera_id=one,
@@ -180,7 +182,7 @@ def camera_facts(
                 names=tuple(name.strip() for name in camera.params_info.split(",")),
                 values=np.array(camera.params, dtype=np.float64),
                 sigmas=sigmas,
-                free=known,
+                free=free[one],
                 correlation=covariance / np.outer(scale, scale),
                 mean_residuals_px=mean_residuals,
                 num_in_cell=num_in_cell,
@@ -216,7 +218,8 @@ def _intrinsics_covariances(
 ) -> dict[int, FloatArray]:
     """(F, F) covariance of the free parameters by camera id, all poses and points being unknown, too."""
     width = max((len(one) for one in free.values()), default=0)
-    if not width or len(model.reg_image_ids()) > MAX_UNCERTAIN_IMAGES:
+    is_large = len(model.reg_image_ids()) > MAX_UNCERTAIN_IMAGES
+    if not width or is_large or width * len(camera_ids) > MAX_UNCERTAIN_PARAMETERS:
         return {}
     linear = LinearisedModel.of(model)
     by_parameter = np.zeros((len(linear.image_of), 2, width))

@@ -293,11 +293,13 @@ def cameras(model: ModelFacts) -> Markup:
 
 def _camera(camera: CameraFacts) -> Markup:
     rows = [
-        (name, f"{value:.6g}", f"± {number(sigma)}" if np.isfinite(sigma) else "fixed")
-        for name, value, sigma in zip(camera.names, camera.values.tolist(), camera.sigmas.tolist(), strict=True)
+        (name, f"{value:.6g}", f"± {number(sigma)}" if np.isfinite(sigma) else "-" if k in camera.free else "fixed")
+        for k, (name, value, sigma) in enumerate(
+            zip(camera.names, camera.values.tolist(), camera.sigmas.tolist(), strict=True)
+        )
     ]
     tables = [table(("parameter", "value", "standard deviation"), rows)]
-    if len(camera.free) > 1:
+    if len(camera.correlation) > 1:
         names = [camera.names[k] for k in camera.free]
         correlations = [
             (name, *(_correlation(value, is_own=j == k) for j, value in enumerate(row)))

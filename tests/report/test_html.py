@@ -26,6 +26,7 @@ from smust3r_colmap.config import OutputConfig
 from smust3r_colmap.execution.progress import QuietReporter
 from smust3r_colmap.refinement.global_refinement import RESULTS, UNCERTAINTIES
 from smust3r_colmap.refinement.model_uncertainty import summarise_uncertainty
+from smust3r_colmap.report import facts
 from smust3r_colmap.report.html import write_report
 from smust3r_colmap.report.summary import ImageNote
 from smust3r_colmap.storage.run_directory import RunDirectory, write_json
@@ -280,6 +281,42 @@ def test_a_model_with_its_database_has_a_verdict(run: Path, tmp_path: Path) -> N
     assert "predicted error" in page.text
     assert "No thumbnails" in page.text
     assert "9 of 9" in page.text
+
+
+def test_a_model_without_points_has_no_uncertainty_and_says_so(run: Path, tmp_path: Path) -> None:
+    model = pycolmap.Reconstruction(run / "sparse/0")
+    for point in list(model.points3D):
+        model.delete_point3D(point)
+    (tmp_path / "model").mkdir()
+    model.write(tmp_path / "model")
+    target = tmp_path / "out.html"
+    words = ["report", str(tmp_path / "model"), "--database", str(run / "work/features/database.db")]
+    assert main([*words, "--output", str(target)]) == 0
+    page = Page(target)
+    assert ("p", {"class": "level weak"}) in page.elements
+    assert "has no tracks, so its residuals and uncertainties are not known" in page.text
+    assert "0 of 30 pairs of images at most 5 apart contradict the model" in page.text
+
+
+def test_what_is_no_database_is_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["report", str(run / "sparse/0"), "--output", str(tmp_path / "out.html")]
+    assert main([*words, "--database", str(run / "summary.json")]) == 2
+    assert "summary.json: is no COLMAP database" in capsys.readouterr().err
+    assert main([*words, "--database", str(run)]) == 2
+    assert "no such file" in capsys.readouterr().err
+
+
+def test_of_many_images_some_have_a_thumbnail_those_with_a_problem_first(
+    run: Path, finished_example: Example, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(facts, "MAX_THUMBNAILS", 5)
+    target = tmp_path / "out.html"
+    assert main(["report", str(run), "--output", str(target)]) == 0
+    page = Page(target)
+    assert "5 of 11 images have a thumbnail, those with a problem first." in page.text
+    cards = [attributes["id"] for attributes in page.all_of("li") if "id" in attributes]
+    shown = [bytes.fromhex(one.removeprefix("image-")).decode() for one in cards]
+    assert shown == [NAMES[k] for k in (0, 3, 6, 9, 10)]
 
 
 def test_two_halves_that_contradict_each_other_are_named(run: Path, tmp_path: Path) -> None:

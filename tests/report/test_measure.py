@@ -7,6 +7,7 @@ import pycolmap
 import pytest
 from helpers.tracked_scenes import CAMERA, arc, ball, make_world, model_with_true_tracks
 
+from smust3r_colmap.report import measure
 from smust3r_colmap.report.measure import camera_facts, observe, residual_grid, triangulation_angles_deg
 
 pytestmark = pytest.mark.usefixtures("quiet_pycolmap")
@@ -35,7 +36,7 @@ def test_a_model_without_points_has_no_residuals() -> None:
     assert np.isnan(found.mean_errors_px).all()
     (camera,) = camera_facts(bare, found, calibrated=False, at_most=4)
     assert np.isnan(camera.sigmas).all()
-    assert camera.free == ()
+    assert len(camera.correlation) == 0
 
 
 def test_angles_are_the_largest_between_two_rays() -> None:
@@ -71,6 +72,14 @@ def test_given_cameras_have_no_sigmas() -> None:
     one = model()
     (camera,) = camera_facts(one, observe(one), calibrated=True, at_most=4)
     assert np.isnan(camera.sigmas).all()
+
+
+def test_of_more_parameters_than_are_solved_for_sigmas_are_not_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measure, "MAX_UNCERTAIN_PARAMETERS", 1)
+    one = model()
+    (camera,) = camera_facts(one, observe(one), calibrated=False, at_most=4)
+    assert np.isnan(camera.sigmas).all()
+    assert camera.free == (0, 3)  # adjusted, not fixed
 
 
 def test_sigmas_grow_with_the_noise() -> None:
