@@ -14,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from smust3r_colmap.errors import InputError
 from smust3r_colmap.features.guided_verification import MatchedFeatures, View
@@ -24,8 +26,11 @@ from smust3r_colmap.refinement.reregistration import pair_support
 
 NEAR = 5
 """Images that are at most so far apart in a sequence are neighbours: what contradicts there is not a look-alike."""
-SEQUENCE_FRACTION = 0.5
-"""Of consecutive images that have verified matches, from which on the order of the names is the order of a path."""
+SEQUENCE_FRACTION, LONG_STEPS = 0.5, 0.6
+"""The order of the names is the order of a path if that part of the consecutive images has verified matches, unless
+steps between them are so long beside the distance of any two images. Of fewer than ``MIN_ORDERED`` images every step
+is long."""
+MIN_ORDERED = 8
 MIN_GROUP = 3
 """Images of a group that is shown."""
 MAX_CELLS = 400
@@ -57,7 +62,7 @@ class Agreement:
     Args:
         support: by pair of rows (i < j), of pairs with at least eight verified matches.
         groups: of at least ``MIN_GROUP`` images, largest first.
-        is_sequence: consecutive images match, so far apart in order is far apart on the path.
+        is_sequence: consecutive images match and are near, so far apart in order is far apart on the path.
     """
 
     num_images: int
@@ -66,15 +71,16 @@ class Agreement:
     is_sequence: bool
 
     @classmethod
-    def of(cls, support: Mapping[Pair, EpipolarSupport], num_images: int) -> Agreement:
-        """Group the images."""
+    def of(cls, support: Mapping[Pair, EpipolarSupport], centres: FloatArray) -> Agreement:
+        """Group the images, whose centres are (N, 3)."""
+        num_images = len(centres)
         found = [rows for rows in consistent_groups(support, range(num_images)) if len(rows) >= MIN_GROUP]
         consecutive = sum(j - i == 1 for i, j in support)
         return cls(
             num_images=num_images,
             support=support,
             groups=tuple(_group(rows, found[:k], support) for k, rows in enumerate(found)),
-            is_sequence=consecutive >= SEQUENCE_FRACTION * max(num_images - 1, 1),
+            is_sequence=consecutive >= SEQUENCE_FRACTION * max(num_images - 1, 1) and not _steps_are_long(centres),
         )
 
     @property
@@ -104,12 +110,20 @@ class Agreement:
         return [(pair, self.support[pair]) for pair in list(of_places.values())[:MAX_WORST_PAIRS]]
 
     def display_order(self) -> IntArray:
-        """(N,) rows in the order of the matrix: that of a sequence; else group by group."""
+        """(N,) rows in the order of the matrix: that of a sequence; else by group, with those near that match."""
         if self.is_sequence:
             return np.arange(self.num_images)
-        grouped = [row for group in self.groups for row in group.rows]
+        grouped = [row for group in self.groups for row in self._near_each_other(group.rows)]
         rest = sorted(set(range(self.num_images)) - set(grouped))
         return np.array([*grouped, *rest], dtype=np.int64)
+
+    def _near_each_other(self, rows: tuple[int, ...]) -> list[int]:
+        place = {row: k for k, row in enumerate(rows)}
+        pairs = [(place[i], place[j]) for i, j in self.support if i in place and j in place]
+        a, b = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+        graph = coo_array((np.ones(len(a)), (a, b)), shape=(len(rows), len(rows)))
+        order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
+        return [rows[k] for k in order.tolist()]
 
     def matrix(self) -> FloatArray:
         """(S, S) fraction of the verified matches that agree, NaN without any; symmetric, see ``MAX_CELLS``."""
@@ -124,6 +138,15 @@ class Agreement:
         with np.errstate(invalid="ignore"):
             fractions: FloatArray = agreeing / total
         return fractions
+
+
+def _steps_are_long(centres: FloatArray) -> bool:
+    if len(centres) < MIN_ORDERED:
+        return False
+    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    others = np.random.default_rng(0).permutation(len(centres))
+    between = np.linalg.norm(centres - centres[others], axis=1)[others != np.arange(len(centres))]
+    return bool(np.median(steps) > LONG_STEPS * np.median(between))
 
 
 def _group(rows: Sequence[int], larger: Sequence[Sequence[int]], support: Mapping[Pair, EpipolarSupport]) -> Group:
@@ -155,7 +178,8 @@ def agreement_of(model: pycolmap.Reconstruction, features: MatchedFeatures) -> A
     row_of = {image_id - 1: row for row, image_id in enumerate(image_ids)}
     found = pair_support(features, views)
     support = {tuple(sorted((row_of[i], row_of[j]))): one for (i, j), one in found.items()}
-    return Agreement.of(dict(sorted(support.items())), len(image_ids))  # type: ignore[arg-type]  # pairs have two rows
+    centres = np.array([model.image(i).projection_center() for i in image_ids]).reshape(-1, 3)
+    return Agreement.of(dict(sorted(support.items())), centres)  # type: ignore[arg-type]  # pairs have two rows
 
 
 def read_verified(database: Path, model: pycolmap.Reconstruction) -> MatchedFeatures:

@@ -92,7 +92,7 @@ def plan(facts: ReportFacts) -> Markup:
     if len(model.paths) > 1:
         said.append("; earlier steps are moved to fit the result best")
     if not is_sequence:
-        said.append(". Consecutive images do not match, so that they are not joined by lines")
+        said.append(". The names are in no order of the path, so they are not joined by lines")
     return section("plan", f"Path of {model.folder}", paragraph(*said, "."), tag("div", *figures, class_="figures"))
 
 
@@ -141,7 +141,9 @@ def _explanation(agreement: Agreement) -> str:
             "folded or torn."
         )
     else:
-        said += "Consecutive images do not match, so the images are in the order of their groups."
+        said += (
+            "The names are in no order, so the images are sorted by group, and those that match are near each other."
+        )
     return said + (f" Several of the {agreement.num_images} images share a cell." * (agreement.num_images > MAX_CELLS))
 
 

@@ -22,6 +22,7 @@ from helpers.tracked_scenes import (
 )
 
 from smust3r_colmap.errors import InputError
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.refinement.misregistration import EpipolarSupport
 from smust3r_colmap.report.agreement import MAX_CELLS, Agreement, agreement_of, coloured, read_verified
 
@@ -29,6 +30,11 @@ pytestmark = pytest.mark.usefixtures("quiet_pycolmap")
 
 GOOD = EpipolarSupport(num_matches=100, inlier_fraction=0.95)
 BAD = EpipolarSupport(num_matches=100, inlier_fraction=0.1)
+
+
+def line(num_images: int) -> FloatArray:
+    """(N, 3) centres on a straight path."""
+    return np.arange(num_images)[:, None] * np.array([1.0, 0, 0])
 
 
 def example(num_images: int = 6) -> tuple[World, pycolmap.Reconstruction]:
@@ -107,28 +113,47 @@ def test_what_is_no_database_is_refused(tmp_path: Path) -> None:
 def test_groups_that_contradict_each_other_are_a_fold() -> None:
     within = {pair: GOOD for part in (range(6), range(6, 10)) for pair in pairs_within(part, 3)}
     across = {(0, 7): BAD, (1, 8): BAD, (5, 6): BAD}
-    found = Agreement.of(within | across, 10)
+    found = Agreement.of(within | across, line(10))
     assert [group.rows for group in found.groups] == [tuple(range(6)), tuple(range(6, 10))]
     assert (found.groups[1].num_supporting, found.groups[1].num_contradicting) == (0, 3)
     assert found.is_split
     assert found.counts(near=True) == (1, 1 + 12 + 6)
     assert found.counts(near=False) == (2, 2)
-    assert not Agreement.of(within | {(5, 6): GOOD}, 10).is_split
+    assert not Agreement.of(within | {(5, 6): GOOD}, line(10)).is_split
 
 
 def test_images_without_an_order_are_shown_group_by_group() -> None:
     odd, even = range(1, 10, 2), range(0, 12, 2)
     support = {(i, j): GOOD for part in (odd, even) for i in part for j in part if i < j} | {(0, 1): BAD}
-    found = Agreement.of(support, 12)
+    found = Agreement.of(support, line(12))
     assert not found.is_sequence
-    assert found.display_order().tolist() == [*even, *odd, 11]
+    order = found.display_order().tolist()
+    assert (sorted(order[:6]), sorted(order[6:11]), order[11]) == ([*even], [*odd], 11)
     assert found.counts(near=True) == (0, 0)
+
+
+def test_images_that_match_are_near_each_other_in_the_matrix() -> None:
+    """A path whose names were shuffled; the matrix has it in order again, from either end."""
+    shuffled = np.random.default_rng(2).permutation(40)
+    place = {int(image): k for k, image in enumerate(shuffled)}
+    support = {(min(place[a], place[b]), max(place[a], place[b])): GOOD for a, b in pairs_within(range(40), 2)}
+    found = Agreement.of(support, line(40)[shuffled])
+    assert not found.is_sequence
+    steps = np.abs(np.diff(shuffled[found.display_order()]))
+    assert steps.max() <= 3
+
+
+def test_where_all_pairs_match_the_steps_tell_whether_there_is_an_order() -> None:
+    support = dict.fromkeys(pairs_within(range(20), 20), GOOD)
+    assert Agreement.of(support, line(20)).is_sequence
+    assert not Agreement.of(support, line(20)[np.random.default_rng(1).permutation(20)]).is_sequence
+    assert Agreement.of({(0, 1): GOOD, (1, 2): GOOD}, line(3)).is_sequence
 
 
 def test_of_many_images_a_cell_has_the_fraction_of_all_its_matches() -> None:
     support = {(i, i + 1): GOOD for i in range(2 * MAX_CELLS - 1)}
     support[0, 2] = EpipolarSupport(num_matches=300, inlier_fraction=0.0)
-    matrix = Agreement.of(support, 2 * MAX_CELLS).matrix()
+    matrix = Agreement.of(support, line(2 * MAX_CELLS)).matrix()
     assert matrix.shape == (MAX_CELLS, MAX_CELLS)
     # (1, 2) with 95 of 100, and (0, 2) with none of 300
     assert matrix[0, 1] == pytest.approx(95 / 400)
