@@ -24,6 +24,7 @@ from smust3r_colmap.cli.doctor import Doctor
 from smust3r_colmap.cli.evaluate import Evaluate
 from smust3r_colmap.cli.export import Export
 from smust3r_colmap.cli.frames import Frames
+from smust3r_colmap.cli.georeference import Georeference
 from smust3r_colmap.cli.presets import PRESETS
 from smust3r_colmap.cli.reconstruct import Reconstruct
 from smust3r_colmap.cli.refine import Refine
@@ -39,6 +40,7 @@ COMMANDS: Mapping[str, type] = {
     "refine": Refine,
     "frames": Frames,
     "export": Export,
+    "georeference": Georeference,
     "report": Report,
     "validate": Validate,
     "evaluate": Evaluate,

@@ -26,6 +26,7 @@ from smust3r_colmap.cli.evaluate import Evaluate, run_evaluate
 from smust3r_colmap.cli.export import Export, run_export
 from smust3r_colmap.cli.fields import REGISTRY
 from smust3r_colmap.cli.frames import Frames, run_frames
+from smust3r_colmap.cli.georeference import Georeference, run_georeference
 from smust3r_colmap.cli.presets import PRESETS
 from smust3r_colmap.cli.reconstruct import Reconstruct, run_reconstruct
 from smust3r_colmap.cli.refine import Refine, run_refine
@@ -42,9 +43,24 @@ _DESCRIPTION = """Offline structure from motion for COLMAP workflows, segment by
 Exit codes: 0 good, 1 failed, 2 wrong use, 3 finished with warnings, 130 interrupted.
 --version prints the version."""
 
-Command = Reconstruct | Refine | Frames | Export | Report | Validate | Evaluate | Demo | Doctor | WeightsCommand
+Command = (
+    Reconstruct
+    | Refine
+    | Frames
+    | Export
+    | Georeference
+    | Report
+    | Validate
+    | Evaluate
+    | Demo
+    | Doctor
+    | WeightsCommand
+)
 
-COMMANDS = ("reconstruct", "refine", "frames", "export", "report", "validate", "evaluate", "demo", "doctor", "weights")
+COMMANDS = (
+    *("reconstruct", "refine", "frames", "export", "georeference", "report", "validate", "evaluate"),
+    *("demo", "doctor", "weights"),
+)
 SETTINGS = {"reconstruct": RunConfig, "refine": RefineConfig}
 """The commands that take a settings file, and what it may hold."""
 
@@ -128,6 +144,8 @@ def _run(command: Command) -> int:  # noqa: PLR0911  (one return per command)
             return run_frames(command)
         case Export():
             return run_export(command)
+        case Georeference():
+            return run_georeference(command)
         case Report():
             return run_report(command)
         case Validate():

@@ -103,6 +103,7 @@ class RunDirectory:
         "dense",
         "summary.json",
         "config.toml",
+        *(f"geo/{name}" for name in ("geo.json", "cameras.geojson", "gcps.geojson")),
         "report.html",
     )
 

@@ -29,6 +29,7 @@ ORDER = (
     "stitching",
     "refinement",
     "dense",
+    "georeferencing",
     "exporters",
     # what looks at results
     "report",
@@ -42,7 +43,7 @@ ORDER = (
 )
 """A room imports from rooms before it only."""
 
-STAGES = ("segmentation", "backbones", "alignment", "stitching", "refinement", "dense", "features")
+STAGES = ("segmentation", "backbones", "alignment", "stitching", "refinement", "dense", "georeferencing", "features")
 
 
 def test_every_room_has_its_place_in_the_order() -> None:

@@ -193,7 +193,8 @@ def test_an_unknown_command_exits_2_with_those_there_are(
     assert cli.main([typed, "photos"]) == 2
     assert capsys.readouterr().err == (
         f"smust3r-colmap: there is no command {typed!r}{meant}; "
-        "the commands are reconstruct, refine, frames, export, report, validate, evaluate, demo, doctor, weights\n"
+        "the commands are reconstruct, refine, frames, export, georeference, report, validate, evaluate, demo, "
+        "doctor, weights\n"
     )
 
 
