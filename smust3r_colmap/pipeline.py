@@ -32,7 +32,7 @@ from smust3r_colmap.exporters.finished_run import begin_stages
 from smust3r_colmap.importers import stage as importers
 from smust3r_colmap.refinement import stage as refinement
 from smust3r_colmap.report import summarise as report
-from smust3r_colmap.report.html import write_report
+from smust3r_colmap.report.html import failure_reported, write_report
 from smust3r_colmap.report.summary import RunSummary
 from smust3r_colmap.segmentation import stage as segmentation
 from smust3r_colmap.stitching import stage as stitching
@@ -68,7 +68,8 @@ def reconstruct(
         backbone = backbones.make(run, factory, collection, config)
         begin_stages(run, scan, overwrite=overwrite)
         segments = segmentation.plan(run, collection, backbone.describe, config)
-        submodels = backbones.reconstruct(backbone, segments, collection, config.alignment)
+        with failure_reported(run, collection, config.output):
+            submodels = backbones.reconstruct(backbone, segments, collection, config.alignment)
         edges = alignment.align(run, submodels, segments, config.alignment)
         stitched = stitching.stitch(run, submodels, edges, segments, collection, config.alignment, config.loop_closing)
         initial = refinement.InitialScenes.of(stitched, segments, maps_key=submodels.dense_key)

@@ -216,6 +216,26 @@ def read_verified(database: Path, model: pycolmap.Reconstruction) -> MatchedFeat
     return MatchedFeatures(keypoints=keypoints, raw={}, verified=there)
 
 
+def count_matches(database: Path) -> dict[int, tuple[int, int, int]]:
+    """Features, verified matches and images that they are with, by image id; see ``read_verified`` for the database.
+
+    Raises:
+        InputError: the file is no COLMAP database.
+    """
+    try:
+        with closing(sqlite3.connect(f"{database.absolute().as_uri()}?immutable=1", uri=True)) as connection:
+            keypoints = dict(connection.execute("SELECT image_id, rows FROM keypoints"))
+            pairs = connection.execute("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0").fetchall()
+    except sqlite3.Error as error:
+        raise InputError(f"{database}: is no COLMAP database, or a damaged one ({error})") from error
+    found = {image_id: (rows, 0, 0) for image_id, rows in keypoints.items()}
+    for pair_id, rows in pairs:
+        for image_id in pycolmap.pair_id_to_image_pair(pair_id):
+            num_features, num_matches, num_images = found.get(image_id, (0, 0, 0))
+            found[image_id] = (num_features, num_matches + rows, num_images + 1)
+    return found
+
+
 def coloured(fractions: FloatArray) -> UInt8Array:
     """(..., 4) RGBA: red where nothing agrees, blue where all does, transparent where there is nothing."""
     known = np.isfinite(fractions)

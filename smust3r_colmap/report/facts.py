@@ -22,6 +22,7 @@ from smust3r_colmap.execution.task_pool import usable_cores
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.importers.colmap_model import read_colmap_model
 from smust3r_colmap.importers.image_folder import natural_key
+from smust3r_colmap.products import ImageCollection
 from smust3r_colmap.refinement.global_refinement import UNCERTAINTIES
 from smust3r_colmap.refinement.model_uncertainty import (
     ModelUncertainty,
@@ -29,7 +30,7 @@ from smust3r_colmap.refinement.model_uncertainty import (
     measure_uncertainty,
     summarise_uncertainty,
 )
-from smust3r_colmap.report.agreement import Agreement, agreement_of, read_verified
+from smust3r_colmap.report.agreement import Agreement, agreement_of, count_matches, read_verified
 from smust3r_colmap.report.measure import CameraFacts, Observed, camera_facts, observe
 from smust3r_colmap.report.plan import RESULT, Path2D, earlier_path, plan_axes, read_centres
 from smust3r_colmap.report.summarise import SEGMENTS_FILE, SUMMARY_FILE
@@ -117,7 +118,7 @@ class ReportFacts:
         verdict: its level and reasons. num_more_reasons: that are in the summary only.
         summary: what ``summary.json`` says, or what can be said of a model alone, in the same form.
         images: in natural order of their names. thumbnails_note: why some have no picture, or empty.
-        model: the largest.
+        model: the largest; None where none came out.
         products: files and folders beside the report.
         settings: the settings file, or empty.
         versions: of what wrote the report.
@@ -129,7 +130,7 @@ class ReportFacts:
     summary: Mapping[str, Any]
     images: tuple[ImageFacts, ...]
     thumbnails_note: str
-    model: ModelFacts
+    model: ModelFacts | None
     products: tuple[str, ...]
     settings: str
     versions: Mapping[str, str]
@@ -237,6 +238,52 @@ def _is_calibrated(settings: str) -> bool:
 def _text_of(path: Path) -> str:
     with storage_errors(path):
         return path.read_text(encoding="utf-8") if path.is_file() else ""
+
+
+def facts_of_failure(collection: ImageCollection, features: Path, reason: str) -> ReportFacts:
+    """Of a run from which no model came out: what its images have in common.
+
+    Args:
+        features: database of the run; it may be missing.
+        reason: the error.
+    """
+    counts = count_matches(features) if features.is_file() else {}
+    states = {image.name: (NO_POSE, _matches_of(counts.get(k + 1))) for k, image in enumerate(collection.images)}
+    states |= {one.name: (UNUSABLE, one.reason) for one in collection.rejected}
+    thumbnails, note = _thumbnails(states, {image.name: image.path for image in collection.images})
+    advice = "look for images without matches below; take more texture and overlap, and a step to the side"
+    return ReportFacts(
+        what=f"{len(collection)} images",
+        verdict=Verdict(level="failed", reasons=(Reason(text=reason.rstrip("."), advice=advice, weight=1.0),)),
+        num_more_reasons=0,
+        summary={},
+        images=tuple(
+            ImageFacts(
+                name=name,
+                state=state,
+                note=said,
+                model="",
+                row=None,
+                num_observations=np.nan,
+                error_px=np.nan,
+                sigma_percent=np.nan,
+                thumbnail=thumbnails.get(name, b""),
+            )
+            for name, (state, said) in sorted(states.items(), key=lambda one: natural_key(one[0]))
+        ),
+        thumbnails_note=note,
+        model=None,
+        products=(),
+        settings="",
+        versions=_versions(),
+    )
+
+
+def _matches_of(counts: tuple[int, int, int] | None) -> str:
+    if counts is None:
+        return "no features"
+    num_features, num_matches, num_images = counts
+    return f"{num_features} features, {num_matches} verified matches with {num_images} images"
 
 
 # ------------------------------------------------------------------------------ models
@@ -370,7 +417,7 @@ def _images(
     if shown.uncertainty is not None:
         percent = 100 * shown.uncertainty.position_sigma / shown.uncertainty.extent
         sigmas = dict(zip(shown.uncertainty.names, percent.tolist(), strict=True))
-    files, note = _thumbnails(state_of, folder)
+    files, note = _thumbnails_in(folder, state_of)
     found = tuple(
         ImageFacts(
             name=name,
@@ -388,19 +435,23 @@ def _images(
     return {"images": found, "thumbnails_note": note}
 
 
-def _thumbnails(state_of: Mapping[str, tuple[int, str]], folder: Path | None) -> tuple[dict[str, bytes], str]:
-    """JPEG data by name, of at most ``MAX_THUMBNAILS`` images, those with a problem first; and why some have none."""
+def _thumbnails_in(folder: Path | None, state_of: Mapping[str, tuple[int, str]]) -> tuple[dict[str, bytes], str]:
     if folder is None:
         return {}, "no thumbnails: it is not known where the images are (--images)"
     if not folder.is_dir():
         return {}, f"no thumbnails: the images are not in {folder.name} any more (--images)"
+    return _thumbnails(state_of, {name: folder / name for name in state_of})
+
+
+def _thumbnails(state_of: Mapping[str, tuple[int, str]], path_of: Mapping[str, Path]) -> tuple[dict[str, bytes], str]:
+    """JPEG data by name, of at most ``MAX_THUMBNAILS`` images, those with a problem first; and why some have none."""
     usable = [name for name, (state, _) in state_of.items() if state != UNUSABLE]
     chosen = [name for name in usable if state_of[name][0] != REGISTERED][:MAX_THUMBNAILS]
     plain = [name for name in usable if state_of[name][0] == REGISTERED]
     room = MAX_THUMBNAILS - len(chosen)
     if plain and room:
         chosen += plain[:: max(1, -(-len(plain) // room))]
-    paths = {name: folder / name for name in chosen}
+    paths = {name: path_of[name] for name in chosen}
     made, problem = make_thumbnails(list(paths.values()), workers=usable_cores())
     notes = []
     if len(chosen) < len(usable):

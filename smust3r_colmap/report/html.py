@@ -8,14 +8,17 @@ The next module to read is ``facts``.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from smust3r_colmap.config import ModelOutputConfig
-from smust3r_colmap.errors import StorageError
+from smust3r_colmap.errors import ReconstructionError, SmustrError, StorageError
 from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.execution.task_pool import TaskFailure, in_child
-from smust3r_colmap.report.facts import facts_of_model, facts_of_run
+from smust3r_colmap.products import ImageCollection
+from smust3r_colmap.report.facts import FEATURES, facts_of_failure, facts_of_model, facts_of_run
 from smust3r_colmap.report.page import render
 from smust3r_colmap.storage.atomic_write import write_atomically
 
@@ -48,6 +51,21 @@ def write_report(run: Run, images: Path, options: ModelOutputConfig) -> None:
         stage.advance()
     if isinstance(outcome, TaskFailure):
         run.clock.warn(f"no {REPORT_FILE}: {outcome.reason}")
+
+
+@contextmanager
+def failure_reported(run: Run, collection: ImageCollection, options: ModelOutputConfig) -> Iterator[None]:
+    """Write a report if no model comes out, with what the images have in common; the error goes on."""
+    try:
+        yield
+    except ReconstructionError as error:
+        if options.report:
+            try:
+                page = render(facts_of_failure(collection, run.folder.root / FEATURES, str(error)))
+                write_atomically(run.folder.root / REPORT_FILE, page.encode())
+            except SmustrError as problem:
+                run.clock.warn(f"no {REPORT_FILE}: {problem}")
+        raise
 
 
 def report_run(task: RunToReport) -> None:

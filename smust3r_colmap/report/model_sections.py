@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.refinement.misregistration import MAX_CONTRADICTING_FRACTION, MIN_CONTRADICTING_MATCHES
 from smust3r_colmap.report import charts
 from smust3r_colmap.report.agreement import MAX_CELLS, NEAR, Agreement, coloured
-from smust3r_colmap.report.facts import ImageFacts, ModelFacts, ReportFacts
+from smust3r_colmap.report.facts import ImageFacts, ModelFacts
 from smust3r_colmap.report.markup import (
     Markup,
     escaped,
@@ -54,15 +55,14 @@ def link_to(image: ImageFacts) -> Markup:
 
 
 # ------------------------------------------------------------------------------ the path
-def plan(facts: ReportFacts) -> Markup:
+def plan(model: ModelFacts, summary: Mapping[str, Any]) -> Markup:
     """The path from above: before loops, before bundle adjustment, in the end."""
-    model = facts.model
     is_sequence = model.agreement is None or model.agreement.is_sequence
     corners = charts.frame_of(model.paths)
     row_of = {name: row for row, name in enumerate(model.names)}
     loops = [
         (row_of[one["image_a"]], row_of[one["image_b"]], one["accepted"])
-        for one in facts.summary.get("loops", ())
+        for one in summary.get("loops", ())
         if one["image_a"] in row_of and one["image_b"] in row_of
     ]
     background = points_from_above(model.observed.xyz, model.axes, *corners)
@@ -106,9 +106,9 @@ def _group_colours(agreement: Agreement) -> list[int]:
 
 
 # ---------------------------------------------------------------------------- the matrix
-def verification_matrix(facts: ReportFacts) -> Markup:
+def verification_matrix(model: ModelFacts, images: Sequence[ImageFacts]) -> Markup:
     """Which pairs of images agree with the model, and which groups of images do with each other."""
-    model, agreement = facts.model, facts.model.agreement
+    agreement = model.agreement
     title = "Verification matrix"
     if agreement is None:
         return section("matrix", title, paragraph(sentence(model.agreement_note)))
@@ -122,7 +122,7 @@ def verification_matrix(facts: ReportFacts) -> Markup:
     content = [
         *(paragraph(line) for line in _counts(agreement)),
         *_groups(agreement, model.names),
-        tag("div", picture, _worst_pairs(facts, agreement), class_="figures"),
+        tag("div", picture, _worst_pairs(images, agreement), class_="figures"),
     ]
     if model.agreement_note:
         content.append(tag("p", sentence(model.agreement_note), class_="rule"))
@@ -201,11 +201,11 @@ def _hex(fraction: float) -> str:
     return "#" + "".join(f"{int(value):02x}" for value in coloured(np.array(fraction))[:3])
 
 
-def _worst_pairs(facts: ReportFacts, agreement: Agreement) -> Markup:
+def _worst_pairs(images: Sequence[ImageFacts], agreement: Agreement) -> Markup:
     worst = agreement.worst_pairs()
     if not worst:
         return Markup("")
-    image_of = {image.row: image for image in facts.images if image.row is not None}
+    image_of = {image.row: image for image in images if image.row is not None}
     rows = [
         (_pictured(image_of[i]), _pictured(image_of[j]), one.num_matches, f"{one.inlier_fraction:.0%}")
         for (i, j), one in worst

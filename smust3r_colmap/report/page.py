@@ -7,14 +7,14 @@ The next module to read is ``model_sections``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from smust3r_colmap.execution.progress import format_seconds
 from smust3r_colmap.report import charts
-from smust3r_colmap.report.facts import REGISTERED, STATES, ImageFacts, ReportFacts
+from smust3r_colmap.report.facts import REGISTERED, STATES, ImageFacts, ModelFacts, ReportFacts
 from smust3r_colmap.report.markup import (
     Markup,
     details,
@@ -49,15 +49,12 @@ MAX_OPEN_ROWS, MAX_OPEN_THUMBNAILS = 40, 60
 
 def render(facts: ReportFacts) -> str:
     """The whole page."""
+    model = facts.model
     sections = [
         _head(facts),
         _verdict(facts),
         _images(facts),
-        plan(facts),
-        verification_matrix(facts),
-        weakest_links(facts.model),
-        cameras(facts.model),
-        histograms(facts.model),
+        *(() if model is None else _sections_of(model, facts)),
         _loops(facts.summary),
         _models(facts.summary),
         _cost(facts.summary),
@@ -77,26 +74,37 @@ def render(facts: ReportFacts) -> str:
     return f"<!DOCTYPE html>\n{tag('html', head, body, lang='en')}\n"
 
 
+def _sections_of(model: ModelFacts, facts: ReportFacts) -> Iterator[Markup]:
+    yield plan(model, facts.summary)
+    yield verification_matrix(model, facts.images)
+    yield weakest_links(model)
+    yield cameras(model)
+    yield histograms(model)
+
+
 def _head(facts: ReportFacts) -> Markup:
-    summary, model = facts.summary, facts.model
     num_posed = sum(image.model != "" for image in facts.images)
-    errors = model.observed.errors_px
-    tiles = [
-        ("images with a pose", f"{num_posed} of {len(facts.images)}"),
-        ("models", len(summary["models"]) if "models" in summary else 1),
-        ("points", number(len(model.observed.track_lengths))),
-        ("reprojection error", f"{number(float(errors.mean()))} px" if len(errors) else "-"),
-    ]
-    if model.uncertainty is not None:
-        tiles.append(("predicted error", f"{number(model.uncertainty.predicted_error_percent)} % of the extent"))
-    if "scale" in summary:
-        tiles.append(("one unit of length", summary["scale"].split(" (")[0]))
+    tiles = [("images with a pose", f"{num_posed} of {len(facts.images)}")]
+    if facts.model is not None:
+        tiles += _tiles(facts.model, facts.summary)
     return tag(
         "header",
         tag("h1", f"Reconstruction of {facts.what}"),
         tag("p", facts.verdict.level, class_=f"level {facts.verdict.level}"),
         tag("dl", *(tag("div", tag("dt", name), tag("dd", value)) for name, value in tiles)),
     )
+
+
+def _tiles(model: ModelFacts, summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """The most important numbers, and what they are."""
+    errors = model.observed.errors_px
+    yield "models", str(len(summary["models"]) if "models" in summary else 1)
+    yield "points", number(len(model.observed.track_lengths))
+    yield "reprojection error", f"{number(float(errors.mean()))} px" if len(errors) else "-"
+    if model.uncertainty is not None:
+        yield "predicted error", f"{number(model.uncertainty.predicted_error_percent)} % of the extent"
+    if "scale" in summary:
+        yield "one unit of length", summary["scale"].split(" (")[0]
 
 
 def _verdict(facts: ReportFacts) -> Markup:

@@ -309,6 +309,9 @@ def test_images_without_overlap_fail_with_what_was_tried(tmp_path: Path) -> None
     write_noise(tmp_path / "noise", 4)
     with pytest.raises(ReconstructionError, match=r"none of the 1 segments \(4 images\).*no pair of images has 15"):
         run(tmp_path / "noise", tmp_path / "out")
+    page = (tmp_path / "out/report.html").read_text(encoding="utf-8")
+    assert "none of the 1 segments (4 images) could be reconstructed" in page
+    assert len(re.findall(r"no pose: [1-9]\d* features, 0 verified matches with 0 images", page)) == 4
 
 
 def test_strangers_among_the_images_are_left_out_by_name(room: Path, tmp_path: Path) -> None:

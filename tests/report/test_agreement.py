@@ -34,7 +34,7 @@ BAD = EpipolarSupport(num_matches=100, inlier_fraction=0.1)
 
 def line(num_images: int) -> FloatArray:
     """(N, 3) centres on a straight path."""
-    return np.arange(num_images)[:, None] * np.array([1.0, 0, 0])
+    return np.outer(np.arange(num_images), [1.0, 0, 0]).astype(np.float64)
 
 
 def example(num_images: int = 6) -> tuple[World, pycolmap.Reconstruction]:

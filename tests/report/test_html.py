@@ -18,16 +18,26 @@ import pytest
 from helpers.finished_runs import NAMES, NUM_PLACED, Example, content
 from helpers.runs import run_in
 from helpers.summaries import GOOD
-from helpers.tracked_scenes import rig_from_world
+from helpers.tracked_scenes import (
+    arc,
+    ball,
+    make_collection,
+    make_world,
+    rig_from_world,
+    true_matches,
+    write_features,
+)
 from PIL import Image
 
 from smust3r_colmap.cli.main import main
 from smust3r_colmap.config import OutputConfig
+from smust3r_colmap.errors import ReconstructionError
 from smust3r_colmap.execution.progress import QuietReporter
+from smust3r_colmap.products import RejectedImage
 from smust3r_colmap.refinement.global_refinement import RESULTS, UNCERTAINTIES
 from smust3r_colmap.refinement.model_uncertainty import summarise_uncertainty
 from smust3r_colmap.report import facts
-from smust3r_colmap.report.html import write_report
+from smust3r_colmap.report.html import failure_reported, write_report
 from smust3r_colmap.report.summary import ImageNote
 from smust3r_colmap.storage.run_directory import RunDirectory, write_json
 
@@ -345,6 +355,40 @@ def test_a_broken_model_is_refused_by_file_and_number(tmp_path: Path, capsys: py
 
 
 # ------------------------------------------------------------------ at the end of a run
+def test_where_no_model_comes_out_the_page_says_what_the_images_have_in_common(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    world = make_world(arc(3), ball(60, rng), rng)
+    collection = replace(
+        make_collection(tmp_path, 3, names={1: NASTY}),
+        rejected=(RejectedImage(name="z.jpg", reason="the file is empty"),),
+    )
+    with RunDirectory(tmp_path / "out") as folder:
+        (folder.work / "features").mkdir()
+        matches = true_matches(world, (0, 1))[:25]
+        write_features(folder.work / "features/database.db", collection, world, verified={(0, 1): matches})
+        with pytest.raises(ReconstructionError), failure_reported(run_in(folder), collection, OutputConfig()):
+            raise ReconstructionError("nothing came out.")
+    page = Page(tmp_path / "out/report.html")
+    assert ("p", {"class": "level failed"}) in page.elements
+    assert "nothing came out. Look for images without matches below" in page.text
+    counts = [len(one) for one in world.keypoints]
+    assert page.text.count(f"no pose: {counts[0]} features, 25 verified matches with 1 images") == 1
+    assert page.text.count(f"no pose: {counts[2]} features, 0 verified matches with 0 images") == 1
+    assert "unusable file: the file is empty" in page.text
+    assert NASTY in page.text
+    assert "0 of 4" in page.text
+    assert "3 thumbnails" in page.text
+
+
+def test_a_failure_leaves_no_report_where_none_is_wanted(tmp_path: Path) -> None:
+    collection = make_collection(tmp_path, 2)
+    with RunDirectory(tmp_path / "out") as folder:
+        options = OutputConfig(report=False)
+        with pytest.raises(ReconstructionError), failure_reported(run_in(folder), collection, options):
+            raise ReconstructionError("nothing came out")
+    assert not (tmp_path / "out/report.html").exists()
+
+
 class _Warnings(QuietReporter):
     """A reporter that keeps the warnings."""
 
