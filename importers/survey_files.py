@@ -16,7 +16,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from smust3r_colmap.errors import InputError
-from smust3r_colmap.importers.gps_tags import up_in_camera
 from smust3r_colmap.importers.survey import (
     ROLES,
     WGS84,
@@ -67,8 +66,9 @@ class _Faults:
 def read_positions_file(path: Path) -> ImagePositions:
     """Positions of images from ``geo.txt`` or, by its suffix, from a CSV table.
 
-    ``geo.txt``: the CRS, then ``image x y [z] [yaw pitch roll] [sigma_h sigma_v]`` (angles from looking down). The
-    table has the columns image, x (or lon), y (or lat), and may have z, sigma_h, sigma_v.
+    ``geo.txt``: the CRS, then ``image x y [z] [yaw pitch roll] [sigma_h sigma_v]``. The angles are not used: some write
+    omega, phi and kappa there, and nothing tells which. The table has the columns image, x (or lon), y (or lat), and
+    may have z, sigma_h, sigma_v.
 
     Raises:
         InputError: the file cannot be read, names no CRS, lacks a column, or has no record that can be used.
@@ -205,8 +205,6 @@ def _position_of_line(line: _Line, faults: _Faults) -> ImagePosition | None:
     row = {"image": words[0], "x": words[1], "y": words[2], **({"z": words[3]} if len(words) > 3 else {})}
     if len(words) >= 9:
         row |= {"sigma_h": words[7], "sigma_v": words[8]}
-    if len(words) >= 7 and all(map(_is_number, words[4:7])):
-        row |= {"pitch": words[5], "roll": words[6]}
     return _checked_position(_Row(values=row, origin=line.origin), faults)
 
 
@@ -230,7 +228,6 @@ def _checked_position(row: _Row, faults: _Faults) -> ImagePosition | None:
     except ValueError as error:
         faults.add(row.origin, f"left out: {error}")
         return None
-    pitch, roll = row.get("pitch"), row.get("roll")
     return ImagePosition(
         image=row.values["image"],
         x=x,
@@ -238,7 +235,6 @@ def _checked_position(row: _Row, faults: _Faults) -> ImagePosition | None:
         z=z,
         sigma_h_m=_sigma(row.get("sigma_h")),
         sigma_v_m=_sigma(row.get("sigma_v")),
-        up_cam=None if pitch is None or roll is None else up_in_camera(float(pitch) - 90, float(roll)),
         origin=row.origin,
     )
 

@@ -28,7 +28,14 @@ from smust3r_colmap.georeferencing.control import (
 from smust3r_colmap.georeferencing.crs import Crs, transform
 from smust3r_colmap.georeferencing.frame import LocalFrame
 from smust3r_colmap.georeferencing.positions import PositionsFit, fit_positions
-from smust3r_colmap.georeferencing.similarity import MAX_SCALE_SIGMA, MAX_TILT_SIGMA_DEG, Correspondences, Fit, fit
+from smust3r_colmap.georeferencing.similarity import (
+    MAX_SCALE_SIGMA,
+    MAX_TILT_SIGMA_DEG,
+    Correspondences,
+    Fit,
+    fit,
+    of_two,
+)
 from smust3r_colmap.georeferencing.survey_in_crs import (
     FAR_M,
     Altitude,
@@ -566,6 +573,10 @@ def _decide(control: Correspondences, gps: _Gps, up: UpDirection | None) -> _Sol
             f"{control.complete.sum()} of {len(control)} control points in the model have three coordinates; alone, "
             f"{MIN_CONTROL} would be needed"
         )
+    if gps.fitted is None and up is not None and control.complete.sum() >= 2:
+        levelled = _by_control_and_up(control, up)
+        if levelled is not None:
+            return _Solved(fit=levelled, basis="control points", up=up, notes=(open_by_control,))
     if gps.fitted is None:
         assert gps.failure is not None
         raise DegenerateAlignmentError(f"{open_by_control}; and by the positions of images: {gps.failure}")
@@ -580,6 +591,18 @@ def _decide(control: Correspondences, gps: _Gps, up: UpDirection | None) -> _Sol
     if needed is not None:
         joined = fit(both, gps.fitted.fit.local_from_model, up_model=needed.up_model, up_sigma_deg=needed.sigma_deg)
     return _Solved(fit=joined, basis="control points and positions of images", up=needed, notes=(open_by_control,))
+
+
+def _by_control_and_up(control: Correspondences, up: UpDirection) -> Fit | None:
+    """From the two complete control points that are farthest apart; none, or two above each other, give none."""
+    complete = control.take(control.complete)
+    apart = np.linalg.norm(complete.local[:, None] - complete.local[None], axis=2)
+    first, second = np.unravel_index(int(np.argmax(apart)), apart.shape)
+    ends = [int(first), int(second)]
+    start = of_two(complete.model[ends], complete.local[ends], up.up_model)
+    if start is None:
+        return None
+    return fit(control, start, up_model=up.up_model, up_sigma_deg=up.sigma_deg, robust=False)
 
 
 # ------------------------------------------------------------------------------------ results

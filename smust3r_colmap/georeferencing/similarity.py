@@ -161,7 +161,7 @@ def consensus(rows: Correspondences, rng: np.random.Generator, *, up_model: Floa
             continue
         chosen = rng.choice(len(usable), count, replace=False)
         a, b = usable.model[chosen], usable.local[chosen]
-        candidate = _of_two(a, b, up_model) if with_up and up_model is not None else _of_three(a, b)
+        candidate = of_two(a, b, up_model) if with_up and up_model is not None else _of_three(a, b)
         if candidate is not None:
             score = _spread(usable.local - candidate.apply(usable.model), usable.sigma)
             if score < best_score:
@@ -190,8 +190,15 @@ def _of_three(a: FloatArray, b: FloatArray) -> Sim3 | None:
     return fitted if fitted.scale > 0 else None
 
 
-def _of_two(a: FloatArray, b: FloatArray, up_model: FloatArray) -> Sim3 | None:
-    """By the horizontal direction and distance between two points, with up as given."""
+def of_two(a: FloatArray, b: FloatArray, up_model: FloatArray) -> Sim3 | None:
+    """By the horizontal direction and distance between two points, with up (3,) as given.
+
+    Args:
+        a, b: (2, 3) in the model and on the ground.
+
+    Returns:
+        None where one lies above the other.
+    """
     across_a = a[1] - a[0] - up_model * (up_model @ (a[1] - a[0]))
     across_b = (b[1] - b[0]) * np.array([1.0, 1.0, 0.0])
     length_a, length_b = np.linalg.norm(across_a), np.linalg.norm(across_b)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 
 import numpy as np
 import pycolmap
@@ -141,11 +142,13 @@ def tags_on_one_pixel(tagged: Mapping[str, Sequence[View]]) -> list[tuple[str, s
     Args:
         tagged: views by label.
     """
-    found = []
-    flat = [(label, view) for label, views in tagged.items() for view in views]
-    for k, (label, view) in enumerate(flat):
-        for other, second in flat[k + 1 :]:
-            near = SAME_PIXEL * view.longer_side
-            if other != label and second.image == view.image and np.linalg.norm(second.xy - view.xy) <= near:
-                found.append((view.image, label, other))
-    return found
+    by_image: dict[str, list[tuple[str, View]]] = {}
+    for label, views in tagged.items():
+        for view in views:
+            by_image.setdefault(view.image, []).append((label, view))
+    return [
+        (image, label, other)
+        for image, in_it in by_image.items()
+        for (label, view), (other, second) in combinations(in_it, 2)
+        if other != label and np.linalg.norm(second.xy - view.xy) <= SAME_PIXEL * view.longer_side
+    ]

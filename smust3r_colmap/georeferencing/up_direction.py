@@ -24,6 +24,8 @@ MIN_DEPTH_RATIO = 2.7
 down have all of them at about one distance. (8 on lund_street, 4 on kitti_a; 1.2 on copr_gcp and caliterra_drone.)"""
 MAX_ANGLE_TO_AXES_DEG = 15.0
 """Between the plumb line of the ground and the middle of the optical axes, for the two to confirm each other."""
+MAX_SLOPE_DEG = 45.0
+"""Between gimbal angles and the plumb line of the ground; programs count angles from the horizon or from the nadir."""
 GIMBAL_SIGMA_DEG, NADIR_SIGMA_DEG, GROUND_SIGMA_DEG, UPRIGHT_SIGMA_DEG = 2.0, 3.0, 5.0, 5.0
 """Ground slopes, and nobody holds a camera exactly; nadir: ground and optical axes agree."""
 _MIN_POINTS = 10
@@ -52,11 +54,10 @@ def find_up(cam_from_model: FloatArray, up_cam: FloatArray, points_model: FloatA
         cam_from_model: (N, 3, 4) poses. up_cam: (N, 3) by gimbal angles; NaN where there are none.
         points_model: (P, 3) of the sparse model.
     """
-    return (
-        _from_gimbals(cam_from_model[:, :, :3], up_cam)
-        or _from_ground(cam_from_model, points_model)
-        or _from_upright_photographs(cam_from_model, points_model)
-    )
+    gimbals, ground = _from_gimbals(cam_from_model[:, :, :3], up_cam), _from_ground(cam_from_model, points_model)
+    if gimbals is not None and ground is not None and _angle_deg(gimbals.up_model, ground.up_model) > MAX_SLOPE_DEG:
+        gimbals = None
+    return gimbals or ground or _from_upright_photographs(cam_from_model, points_model)
 
 
 def _from_gimbals(rotations: FloatArray, up_cam: FloatArray) -> UpDirection | None:
@@ -83,7 +84,7 @@ def _from_ground(cam_from_model: FloatArray, points: FloatArray) -> UpDirection 
     if thickness > MAX_THICKNESS or np.median(steepness) > MAX_ANGLE_TO_GROUND_DEG:
         return None
     axis, _ = _middle(-rotations[:, 2])
-    nadir = bool(np.degrees(np.arccos(np.clip(axis @ normal, -1, 1))) < MAX_ANGLE_TO_AXES_DEG)
+    nadir = _angle_deg(axis, normal) < MAX_ANGLE_TO_AXES_DEG
     source = "the plane of the ground, on which the images look down" if nadir else "the plane of the ground"
     sigma_deg = NADIR_SIGMA_DEG if nadir else GROUND_SIGMA_DEG
     return UpDirection(up_model=normal, source=source, sigma_deg=sigma_deg, confirmed=nadir)
@@ -121,6 +122,10 @@ def _depth_ratio(cam_from_model: FloatArray, points: FloatArray) -> float:
             near, far = np.quantile(depth, (0.1, 0.9))
             ratios.append(float(far / near))
     return float(np.median(ratios)) if ratios else 1.0
+
+
+def _angle_deg(a: FloatArray, b: FloatArray) -> float:
+    return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
 
 
 def _middle(directions: FloatArray) -> tuple[FloatArray, float]:

@@ -9,6 +9,7 @@ import pytest
 from helpers.surveys import PIXEL_M, Survey, make_survey, with_moved
 
 from smust3r_colmap.errors import DegenerateAlignmentError, InputError
+from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.georeferencing.georeference import Georeference, georeference
 from smust3r_colmap.georeferencing.survey_in_crs import Altitude
 from smust3r_colmap.importers.survey import ImagePosition, ImagePositions, Role, SurveyPoints
@@ -39,9 +40,10 @@ def find(
     )
 
 
-def camera_errors(survey: Survey, found: Georeference) -> np.ndarray:
+def camera_errors(survey: Survey, found: Georeference) -> FloatArray:
     truth = survey.frame.crs_from_local(survey.centres_local)
-    return found.to_crs(survey.model().centres_model) - truth
+    errors: FloatArray = found.to_crs(survey.model().centres_model) - truth
+    return errors
 
 
 # ------------------------------------------------------------------------------- accuracy
@@ -142,12 +144,22 @@ def test_two_control_points_take_turn_and_scale_from_gps_and_its_shift_is_found(
     assert any("alone, 3 would be needed" in text for text in found.warnings)
 
 
+def test_two_control_points_alone_are_levelled_by_the_ground() -> None:
+    found = find(SURVEY, None, SURVEY.points(np.random.default_rng(6), 2, tag_px=0.1))
+    assert found.basis == "control points"
+    assert found.up is not None
+    turn = found.local_from_model.rotation @ SURVEY.local_from_model.rotation.T
+    assert np.degrees(np.arccos(turn[2, 2])) < 4
+    assert float(found.local_from_model.scale) == pytest.approx(7.3, rel=0.01)
+    assert any(text.startswith("which way is up was taken from the plane of the ground") for text in found.warnings)
+
+
 def test_too_little_is_refused_with_both_reasons() -> None:
     rng = np.random.default_rng(6)
     with pytest.raises(
-        DegenerateAlignmentError, match=r"2 of 2 control points .* alone, 3 would be needed; and by the"
+        DegenerateAlignmentError, match=r"1 of 1 control points .* alone, 3 would be needed; and by the"
     ):
-        find(SURVEY, None, SURVEY.points(rng, 2))
+        find(SURVEY, None, SURVEY.points(rng, 1))
 
 
 @pytest.mark.slow

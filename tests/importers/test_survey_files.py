@@ -33,7 +33,7 @@ def test_geo_txt_of_opendronemap(tmp_path: Path) -> None:
     assert (found.crs, found.crs_origin, found.faults) == ("EPSG:25832", "geo.txt:1", ())
     assert (a.image, a.x, a.y, a.z, a.origin) == ("a.jpg", 600000.5, 5300001.25, None, "geo.txt:3")
     assert (b.z, b.up_cam) == (560.5, None)
-    assert c.up_cam == pytest.approx((0, 0, -1), abs=1e-12)  # pitch 0 looks down
+    assert (c.z, c.sigma_h_m, c.up_cam) == (561, None, None)  # angles may be yaw, pitch, roll or omega, phi, kappa
     assert (d.sigma_h_m, d.sigma_v_m) == (0.02, 0.03)
 
 
