@@ -134,18 +134,12 @@ def evaluate(
         InputError: no pose of the one has a pose in the other.
         DegenerateAlignmentError: fewer than three poses are compared, or they do not determine the alignment.
     """
-    first = models[0]
-    associations = [
-        associate(
-            model,
-            reference,
-            options.associate,
-            max_difference_s=options.max_time_difference,
-            offset_s=options.time_offset,
-        )
-        for model in models[: len(models) if first.names and reference.names else 1]
-    ]
-    compared = _compared(first, reference, associations[0], options)
+    first, *others = models
+    association = associate(
+        first, reference, options.associate, max_difference_s=options.max_time_difference, offset_s=options.time_offset
+    )
+    associations = [association, *(match_names(model.names, reference.names) for model in others)]
+    compared = _compared(first, reference, association, options)
     rows = [
         *_absolute(compared),
         _scale(compared),
@@ -196,7 +190,7 @@ def _described(poses: PoseSet) -> str:
 def _notes(models: Sequence[PoseSet], reference: PoseSet) -> Iterator[str]:
     if len(models) > 1:
         others = ", ".join(f"{model.place.name} ({len(model)} poses)" for model in models[1:])
-        yield f"the figures are those of the largest model; auc_colmap counts the others, too: {others}"
+        yield f"figures are those of the largest model; auc_colmap, by image names, counts the others, too: {others}"
     if reference.is_model:
         yield "the reference is a reconstruction: its errors count as errors of the estimate"
 

@@ -6,6 +6,7 @@ The next module to read is ``correspondences``.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -41,8 +42,11 @@ _BYTES_PER_FEATURE = 72
 _DESCRIPTORS: Codec[Float32Array] = Codec(Float32Array, "descriptors")
 
 
-def features_of_run(run: Run, collection: ImageCollection, options: FeatureConfig) -> RunFeatures:
-    """Extract what no earlier start extracted; a second call finds everything done."""
+def feature_database_of_run(run: Run, collection: ImageCollection, options: FeatureConfig) -> tuple[Path, str]:
+    """The database that the features of the run go to, with cameras and images, and the key of its stage.
+
+    What is in it is not made again.
+    """
     images = [(image.digest, image.width, image.height, image.camera) for image in collection.images]
     settings = (options.max_image_size, options.max_features, run.seed)
     masks = (collection.mask_digests,) if collection.mask_digests else ()
@@ -51,6 +55,12 @@ def features_of_run(run: Run, collection: ImageCollection, options: FeatureConfi
     there = database.stat().st_size if database.exists() else 0
     run.folder.check_space("the features", len(collection) * options.max_features * _BYTES_PER_FEATURE - there)
     create_database(database, collection)
+    return database, stored.key
+
+
+def features_of_run(run: Run, collection: ImageCollection, options: FeatureConfig) -> RunFeatures:
+    """Extract what no earlier start extracted; a second call finds everything done."""
+    database, key = feature_database_of_run(run, collection, options)
     with run.clock.stage("features", total=len(collection)) as stage:
         rejected = extract_features(
             database,
@@ -64,7 +74,7 @@ def features_of_run(run: Run, collection: ImageCollection, options: FeatureConfi
         run.clock.warn(f"no features: {image.name} ({image.reason})")
     lost = {image.name for image in rejected}
     usable = tuple(image.name not in lost for image in collection.images)
-    return RunFeatures(database=database, key=stored.key, usable=usable, rejected=rejected)
+    return RunFeatures(database=database, key=key, usable=usable, rejected=rejected)
 
 
 def match_pairs_of_run(

@@ -119,7 +119,7 @@ def test_open3d_is_imported_where_a_mesh_is_made_and_nowhere_else() -> None:
     assert [path.name for path in files if importing.search(path.read_text(encoding="utf-8"))] == ["mesh.py"]
 
 
-@pytest.mark.parametrize("name", ["scripts/quickstart", "scripts/test", ".ci/run"])
+@pytest.mark.parametrize("name", ["scripts/quickstart", "scripts/test", "scripts/colmap_shim", ".ci/run"])
 def test_scripts_can_be_started_and_parse(name: str) -> None:
     assert os.access(ROOT / name, os.X_OK)
     subprocess.run(["bash", "-n", str(ROOT / name)], check=True)

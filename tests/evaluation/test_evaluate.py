@@ -109,6 +109,14 @@ def test_all_models_count_in_colmaps_definition_and_the_largest_in_all_else() ->
     assert "largest model" in found.notes[0]
 
 
+def test_another_model_of_images_that_the_reference_lacks_counts_as_wrong() -> None:
+    """12 images are right, and 3 others are in a model of their own: 132 of 132 + 6 ordered pairs."""
+    unknown = pose_set(CENTRES[:3], ROTATIONS[:3], first=100)
+    found = evaluate([pose_set(world=OTHER_WORLD), unknown], pose_set(), EvaluateConfig())
+    assert value(found, "auc_colmap", "at_1_deg") == pytest.approx(100 * 132 / 138, rel=1e-5)
+    assert "3 of the estimate are unknown" in row(found, "auc_colmap").note
+
+
 def test_a_trajectory_by_time_has_no_missing_images() -> None:
     found = evaluate([pose_set(named=False, world=OTHER_WORLD)], pose_set(named=False), EvaluateConfig())
     assert "auc_colmap" not in {one.metric for one in found.rows}
