@@ -112,7 +112,8 @@ def _verdict(facts: ReportFacts) -> Markup:
     content = [tag("ol", *reasons)] if reasons else [paragraph("Nothing speaks against the result.")]
     if facts.num_more_reasons > 0:
         content.append(paragraph(f"{facts.num_more_reasons} more reasons are in summary.json."))
-    content += [paragraph(sentence(note)) for note in facts.summary.get("notes", ())]
+    notes = (note for key in ("notes", "model_notes") for note in facts.summary.get(key, ()))
+    content += [paragraph(sentence(note)) for note in notes]
     rule = (
         f"Weak: any reason, among them a predicted error of {WEAK_PERCENT:g} % of the extent of the path, or "
         f"{WEAK_IMAGE_PERCENT:g} % for one image. Failed: {FAILED_PERCENT:g} %, or a largest model without tracks. "

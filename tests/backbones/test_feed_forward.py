@@ -346,7 +346,7 @@ CONFIG = RunConfig(
     segmentation=SegmentationConfig(segment_length=8, overlap=4),
     # The room is exact; features of images of 80 x 60 pixels would only add their own noise.
     refinement=RefinementConfig(refine=False),
-    output=OutputConfig(trainer=False, dense=False),
+    output=OutputConfig(trainer=False, dense=False, report=False),
 )
 ROOM_PACKAGE = """
 from dataclasses import dataclass

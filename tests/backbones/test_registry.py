@@ -279,7 +279,7 @@ def test_the_example_of_the_page_reconstructs_the_demo(mynet: Path, tmp_path: Pa
         backbone="mynet",
         backbone_options=f"weights={mynet}",
         segmentation=SegmentationConfig(segment_length=8, overlap=4),
-        output=OutputConfig(trainer=False, dense=False),
+        output=OutputConfig(trainer=False, dense=False, report=False),
     )
     summary = reconstruct(tmp_path / "room" / "images", tmp_path / "out", config, reporter=QuietReporter(sys.stderr))
 

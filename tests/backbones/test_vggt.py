@@ -302,7 +302,7 @@ def test_a_whole_run_gives_the_true_trajectory(room: Room, checkpoint: Path, tmp
         segmentation=SegmentationConfig(segment_length=6, overlap=3),
         loop_closing=LoopConfig(loop_closure=False),
         refinement=RefinementConfig(refine=False),  # the photographs of this room have nothing for SIFT
-        output=OutputConfig(trainer=False, dense=False),
+        output=OutputConfig(trainer=False, dense=False, report=False),
     )
     summary = reconstruct(tmp_path / "images", tmp_path / "out", config, reporter=QuietReporter(sys.stderr))
     assert (summary.exit_code, summary.weak_reasons, summary.metric) == (0, (), False)

@@ -181,6 +181,9 @@ def test_the_files_are_those_of_a_reconstruction(result: RunSummary) -> None:
     names = {path.name for path in result.output.iterdir()}
     assert names >= {"points.ply", "scene.glb", "trajectory_tum.txt", "trajectory_stitched_tum.txt"}
     assert "config.toml" in names and not names & {"trainer", "dense"}
+    page = (result.output / "report.html").read_text(encoding="utf-8")
+    assert "8 cameras with one image each became one" in page
+    assert "before bundle adjustment" in page.lower()
 
 
 def test_the_settings_are_in_the_summary(result: RunSummary) -> None:

@@ -35,7 +35,7 @@ CONFIG = RunConfig(
     features=FeatureConfig(max_image_size=1024, max_features=2500),
     classical=ClassicalConfig(dense_size=256),
     fusion=FusionConfig(max_points=100_000),
-    output=OutputConfig(trainer=False, dense=False),
+    output=OutputConfig(trainer=False, dense=False, report=False),
 )
 
 

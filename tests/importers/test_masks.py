@@ -366,7 +366,7 @@ SETTINGS = RunConfig(
     features=FeatureConfig(max_features=800),
     classical=ClassicalConfig(dense_size=96, depth_planes=16),
     loop_closing=LoopConfig(loop_closure=False),
-    output=OutputConfig(dense=False),
+    output=OutputConfig(dense=False, report=False),
     workers=1,
 )
 

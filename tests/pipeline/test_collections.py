@@ -38,7 +38,7 @@ CONFIG = RunConfig(
     features=FeatureConfig(max_features=1200),
     classical=ClassicalConfig(dense_size=160, depth_planes=32),
     fusion=FusionConfig(max_points=20_000),
-    output=OutputConfig(trainer=False, dense=False),
+    output=OutputConfig(trainer=False, dense=False, report=False),
 )
 NUM_IMAGES = 40
 STRANGERS = ("0_stranger0.png", "0_stranger1.png", "0_stranger2.png")

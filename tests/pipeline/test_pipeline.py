@@ -60,12 +60,13 @@ CONFIG = RunConfig(
     features=FeatureConfig(max_features=1200),
     classical=ClassicalConfig(dense_size=160, depth_planes=32),
     fusion=FusionConfig(max_points=20_000),
-    output=OutputConfig(text=True, trainer=False, dense=False),
+    output=OutputConfig(text=True, trainer=False, dense=False, report=False),
 )
 
-BRIEF = replace(CONFIG, segmentation=SegmentationConfig(segment_length=8, overlap=4))
-WITHOUT_TEXT = replace(CONFIG, output=OutputConfig(trainer=False, dense=False))
-UNREFINED = replace(CONFIG, refinement=RefinementConfig(refine=False))
+WITH_REPORT = replace(CONFIG, output=replace(CONFIG.output, report=True))
+BRIEF = replace(WITH_REPORT, segmentation=SegmentationConfig(segment_length=8, overlap=4))
+WITHOUT_TEXT = replace(CONFIG, output=OutputConfig(trainer=False, dense=False, report=False))
+UNREFINED = replace(WITH_REPORT, refinement=RefinementConfig(refine=False))
 NO_LOOPS = LoopConfig(loop_closure=False)
 
 
@@ -308,7 +309,7 @@ def write_noise(folder: Path, count: int) -> None:
 def test_images_without_overlap_fail_with_what_was_tried(tmp_path: Path) -> None:
     write_noise(tmp_path / "noise", 4)
     with pytest.raises(ReconstructionError, match=r"none of the 1 segments \(4 images\).*no pair of images has 15"):
-        run(tmp_path / "noise", tmp_path / "out")
+        run(tmp_path / "noise", tmp_path / "out", WITH_REPORT)
     page = (tmp_path / "out/report.html").read_text(encoding="utf-8")
     assert "none of the 1 segments (4 images) could be reconstructed" in page
     assert len(re.findall(r"no pose: [1-9]\d* features, 0 verified matches with 0 images", page)) == 4
@@ -325,6 +326,9 @@ def test_strangers_among_the_images_are_left_out_by_name(room: Path, tmp_path: P
     assert summary.num_registered == 10
     assert [one.name for one in summary.unregistered] == ["000004_stranger.png"]
     assert [one.name for one in summary.rejected] == ["000005_broken.jpg"]
+    page = (tmp_path / "out/report.html").read_text(encoding="utf-8")
+    assert "10 of 12" in page
+    assert "The model has no tracks, hence no residuals." in page
 
 
 def test_two_unconnected_rooms_become_two_models_largest_first(room: Path, tmp_path: Path) -> None:
@@ -333,8 +337,12 @@ def test_two_unconnected_rooms_become_two_models_largest_first(room: Path, tmp_p
     photograph(DemoScene(5), images, num_images=24, count=6)
     for k in range(10):
         shutil.copy(room / f"images/{k:06d}.jpg", images / f"b{k}.jpg")
-    summary = run(images, tmp_path / "out", replace(CONFIG, segmentation=SegmentationConfig()))
+    summary = run(images, tmp_path / "out", replace(WITH_REPORT, segmentation=SegmentationConfig()))
     assert [model.num_images for model in summary.models] == [10, 6]
+    page = (tmp_path / "out/report.html").read_text(encoding="utf-8")
+    assert "16 of 16" in page
+    assert "Path of sparse/0" in page
+    assert "<td>sparse/1</td><td>6</td>" in page
     assert summary.exit_code == 3
     assert any("2 models" in reason for reason in summary.weak_reasons)
     first = pycolmap.Reconstruction(tmp_path / "out/sparse/0")

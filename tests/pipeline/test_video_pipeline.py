@@ -37,7 +37,7 @@ CONFIG = RunConfig(
     video=VideoConfig(fps=RATE),
     features=FeatureConfig(max_features=1200),
     classical=ClassicalConfig(dense_size=64, depth_planes=12),
-    output=OutputConfig(trainer=False, dense=False),
+    output=OutputConfig(trainer=False, dense=False, report=False),
 )
 
 
