@@ -17,6 +17,8 @@ from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics, pixel_centres
 
 FloatMap = npt.NDArray[np.float32]
+_NOTHING = np.iinfo(np.uint64).max
+"""Of a pixel that no point falls on."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,23 +51,28 @@ def carry_depth(
     """
     height, width = views[0].depth.shape
     own = intrinsics.resized(width, height)
-    depths, confidences, cells = [], [], []
+    nearest = np.full(height * width, _NOTHING)
     for view in views:
         points_cam, confidence = _points_in(view, cam_from_world)
+        value = _by_depth(points_cam[:, 2], confidence)
         corner = np.floor(own.xy_img(points_cam) - 0.5)
         for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
             x, y = corner[:, 0] + dx, corner[:, 1] + dy
             inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)  # False for NaN
-            depths.append(points_cam[inside, 2])
-            confidences.append(confidence[inside])
-            cells.append((y[inside] * width + x[inside]).astype(np.int64))
-    depth, cell = np.concatenate(depths), np.concatenate(cells)
-    far_first = np.argsort(-depth, kind="stable")  # of the pixels that fall on one, the last is the nearest
-    carried = np.zeros(height * width, np.float32)
-    carried[cell[far_first]] = depth[far_first]
-    trusted = np.ones(height * width, np.float32)
-    trusted[cell[far_first]] = np.concatenate(confidences)[far_first]
+            np.minimum.at(nearest, (y[inside] * width + x[inside]).astype(np.int64), value[inside])
+    seen = nearest != _NOTHING
+    carried = np.where(seen, (nearest >> np.uint64(32)).astype(np.uint32).view(np.float32), np.float32(0))
+    trusted = np.where(seen, nearest.astype(np.uint32).view(np.float32), np.float32(1))
     return carried.reshape(height, width), trusted.reshape(height, width)
+
+
+def _by_depth(depth: FloatArray, confidence: FloatMap) -> npt.NDArray[np.uint64]:
+    """(P,) both numbers in one integer, which is the smaller the nearer the point is; depths are positive.
+
+    Positive floating-point numbers have the order of their bits.
+    """
+    high, low = (np.ascontiguousarray(one, dtype=np.float32).view(np.uint32) for one in (depth, confidence))
+    return (high.astype(np.uint64) << np.uint64(32)) | low
 
 
 def _points_in(view: DepthView, cam_from_world: FloatArray) -> tuple[FloatArray, FloatMap]:

@@ -11,10 +11,8 @@ Govindu, "Efficient and robust large-scale rotation averaging", ICCV 2013. The n
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -22,9 +20,9 @@ import pycolmap
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from smust3r_colmap.colmap.database import open_database, write_images
+from smust3r_colmap.colmap.database import open_database
+from smust3r_colmap.features.view_graph_calibration import VerifiedPairs, calibrated_cameras
 from smust3r_colmap.geometry.arrays import FloatArray, Pair
-from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.so3 import angles_between
 
 MAX_ROTATION_ERROR_DEG = 20.0
@@ -36,30 +34,14 @@ METHOD_VERSION = 2
 """To be raised when the pairs found may change, so that finished folders look again."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class RotationTask:
-    """Pairs of a database whose rotations are to be compared.
+def rotation_errors_deg(task: VerifiedPairs) -> npt.NDArray[np.float64]:
+    """(E,) angle in degrees between the rotation of each pair and the averaged ones; NaN where there is none.
 
-    Args:
-        database: with keypoints and two-view geometries; image ids are index + 1.
-        pairs: verified, ascending.
-        cameras: start values by camera index.
-        camera_of: camera index by image.
-        seed: of the samplers.
+    A focal length that is twice too long halves every rotation, and no cycle closes, so cameras are calibrated first.
     """
-
-    database: Path
-    pairs: tuple[Pair, ...]
-    cameras: tuple[Intrinsics, ...]
-    camera_of: Mapping[int, int]
-    seed: int
-
-
-def rotation_errors_deg(task: RotationTask) -> npt.NDArray[np.float64]:
-    """(E,) angle in degrees between the rotation of each pair and the averaged ones; NaN where there is none."""
     if not task.pairs:
         return np.zeros(0)
-    relative = _relative_rotations(replace(task, cameras=_calibrated(task)))
+    relative = _relative_rotations(replace(task, cameras=calibrated_cameras(task)))
     rotations: dict[int, FloatArray] = {}
     for pairs in _components([pair for pair in task.pairs if pair in relative]):
         rotations |= _averaged(pairs, relative, task)
@@ -71,36 +53,7 @@ def rotation_errors_deg(task: RotationTask) -> npt.NDArray[np.float64]:
     return errors
 
 
-def _calibrated(task: RotationTask) -> tuple[Intrinsics, ...]:
-    """The cameras with focal lengths from the fundamental matrices of the pairs, where COLMAP finds one.
-
-    A focal length that is twice too long halves every rotation, and no cycle closes.
-    """
-    images = sorted({image for pair in task.pairs for image in pair})
-    with tempfile.TemporaryDirectory(prefix="smust3r-calibrate-") as scratch:
-        path = Path(scratch) / "pairs.db"
-        with (
-            open_database(task.database) as run,
-            pycolmap.Database.open(path) as own,
-            pycolmap.DatabaseTransaction(own),
-        ):
-            write_images(own, task.cameras, [(image, task.camera_of[image]) for image in images])
-            for image in images:
-                own.write_keypoints(image + 1, run.read_keypoints(image + 1))
-            for first, second in task.pairs:
-                geometry = run.read_two_view_geometry(first + 1, second + 1)
-                if geometry.F is not None:  # COLMAP stops without; a pair of known cameras has none
-                    own.write_two_view_geometry(first + 1, second + 1, geometry)
-        options = pycolmap.ViewGraphCalibrationOptions()
-        options.reestimate_relative_pose = False
-        options.random_seed = task.seed
-        pycolmap.calibrate_view_graph(path, options)
-        with pycolmap.Database.open(path) as own:
-            found = {camera.camera_id - 1: Intrinsics.from_colmap(camera) for camera in own.read_all_cameras()}
-    return tuple(found.get(k, camera) for k, camera in enumerate(task.cameras))
-
-
-def _relative_rotations(task: RotationTask) -> dict[Pair, FloatArray]:
+def _relative_rotations(task: VerifiedPairs) -> dict[Pair, FloatArray]:
     """(3, 3) rotation from the first camera of a pair to the second; without pairs that have no relative pose."""
     options = pycolmap.TwoViewGeometryOptions()
     options.compute_relative_pose = True
@@ -139,7 +92,7 @@ def _components(pairs: Sequence[Pair]) -> list[list[Pair]]:
     return of_component
 
 
-def _averaged(pairs: Sequence[Pair], relative: Mapping[Pair, FloatArray], task: RotationTask) -> dict[int, FloatArray]:
+def _averaged(pairs: Sequence[Pair], relative: Mapping[Pair, FloatArray], task: VerifiedPairs) -> dict[int, FloatArray]:
     """(3, 3) rotation of every image of connected pairs, by image index; none where averaging fails."""
     graph, model = pycolmap.PoseGraph(), pycolmap.Reconstruction()
     camera = pycolmap.Camera(camera_id=1, model="SIMPLE_PINHOLE", width=2, height=2, params=[1, 1, 1])

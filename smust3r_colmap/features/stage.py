@@ -23,13 +23,14 @@ from smust3r_colmap.features.pairs import alike_pairs, neighbouring_pairs
 from smust3r_colmap.features.rotation_consistency import (
     MAX_ROTATION_ERROR_DEG,
     METHOD_VERSION,
-    RotationTask,
     rotation_errors_deg,
 )
 from smust3r_colmap.features.sift import extract_features
 from smust3r_colmap.features.stationary import NO_REGIONS, StaticRegions, describe
+from smust3r_colmap.features.view_graph_calibration import VerifiedPairs, cross_validated_cameras
 from smust3r_colmap.features.vlad import FEATURES_PER_IMAGE, vlad_descriptors
 from smust3r_colmap.geometry.arrays import Float32Array, Pair
+from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import ImageCollection, RunFeatures, Scene
 from smust3r_colmap.storage.codec import Codec
 from smust3r_colmap.storage.run_directory import key_of
@@ -39,6 +40,7 @@ _STATIC_REGIONS: Codec[StaticRegions] = Codec(StaticRegions, "static_regions")
 _PAIRS: Codec[tuple[Pair, ...]] = Codec(tuple[Pair, ...], "pairs")
 _BYTES_PER_FEATURE = 72
 """Half of a descriptor and a keypoint: images have fewer features than are allowed."""
+_CAMERAS: Codec[tuple[Intrinsics, ...]] = Codec(tuple[Intrinsics, ...], "cameras")
 _DESCRIPTORS: Codec[Float32Array] = Codec(Float32Array, "descriptors")
 
 
@@ -124,18 +126,46 @@ def verified_pairs(run: Run, features: RunFeatures, pairs: Iterable[Pair], *, ti
     return dict(sorted(found.items()))
 
 
-def look_alike_pairs(
+def cross_validated_cameras_of_run(
     run: Run, features: RunFeatures, collection: ImageCollection, pairs: Iterable[Pair]
-) -> tuple[Pair, ...]:
-    """Verified pairs whose relative rotation the others contradict, ascending; see ``rotation_consistency``."""
-    tested = tuple(sorted(pairs))
-    task = RotationTask(
+) -> tuple[Intrinsics, ...]:
+    """The collection's cameras with the focal lengths that verified pairs agree on, by camera index.
+
+    See ``view_graph_calibration``.
+    """
+    verified = _verified(run, features, collection, pairs)
+
+    def compute(progress: Stage) -> tuple[Intrinsics, ...]:
+        cameras = in_child(cross_validated_cameras, verified, log_file=run.folder.native_log)
+        progress.advance()
+        if isinstance(cameras, TaskFailure):
+            raise ReconstructionError(cameras.reason)
+        return cameras
+
+    try:
+        inputs = (features.key, verified.pairs, run.seed)
+        return run.cached("view_graph_calibration", inputs, compute, _CAMERAS, title="focal lengths")
+    except ReconstructionError as error:  # not stored, so that the next start tries again
+        run.clock.warn(f"mapping begins with guessed focal lengths: {error}")
+        return collection.cameras
+
+
+def _verified(run: Run, features: RunFeatures, collection: ImageCollection, pairs: Iterable[Pair]) -> VerifiedPairs:
+    return VerifiedPairs(
         database=features.database,
-        pairs=tested,
+        pairs=tuple(sorted(pairs)),
         cameras=collection.cameras,
         camera_of={k: image.camera for k, image in enumerate(collection.images)},
         seed=run.seed,
     )
+
+
+def look_alike_pairs(
+    run: Run, features: RunFeatures, collection: ImageCollection, pairs: Iterable[Pair]
+) -> tuple[Pair, ...]:
+    """Verified pairs whose relative rotation the others contradict, ascending; see ``rotation_consistency``."""
+    task = _verified(run, features, collection, pairs)
+    tested = task.pairs
 
     def compute(progress: Stage) -> tuple[Pair, ...]:
         errors_deg = in_child(rotation_errors_deg, task, log_file=run.folder.native_log)

@@ -4,7 +4,8 @@
              (segments of large models first)
     fine     the same again at the adjusted poses with a smaller tolerance; images without a pose are registered,
              misregistered images re-registered
-    final    bundle adjustment, completing tracks and filtering in turn until the cameras stop moving
+    final    bundle adjustment, completing tracks and filtering in turn until the cameras stop moving; then the images
+             between keyframes are registered
 
 The next module to read is ``stage``.
 """
@@ -95,6 +96,7 @@ class RefineTask:
         principal_point: refine the principal points where the model determines them.
         register_missing: let COLMAP's mapper register images without a pose in the end, in the largest model.
         initial_poses_count: see ``measure_uncertainty``.
+        others: images that are no keyframes; they are registered to the model when it is finished.
     """
 
     stored: StageFolder
@@ -110,6 +112,7 @@ class RefineTask:
     principal_point: bool = True
     register_missing: bool = False
     initial_poses_count: bool = False
+    others: tuple[int, ...] = ()
 
 
 def refine_scenes(task: RefineTask) -> tuple[SceneRefinement, ...]:
@@ -189,7 +192,7 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
     fine = Tolerance(pixels=fine_px, angle_deg=FINE_ANGLE_DEG)
     session = MapperSession(
         task.collection,
-        features,
+        _without(task.others, features),
         tuple(scene.cameras.get(i, prior) for i, prior in enumerate(task.collection.cameras)),
         dict(zip(scene.image_indices, scene.cam_from_world, strict=True)),
         tolerance=task.tolerance,
@@ -216,6 +219,9 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
     _adjust_until_converged(session, fine)
     warnings = _warnings(session, reregistered, may_zoom=_may_zoom(task))
     session.reset_weak_images()
+    if task.others:
+        session.register_between(features, task.others, _final_max_error_px(fine))
+        session.reset_weak_images()
     session.end()
     _extract_colors(session.model, task.collection)
     return _outcome(task, session, principal_point=principal_point, warnings=warnings)
@@ -249,9 +255,13 @@ def _adjust_until_converged(session: MapperSession, tolerance: Tolerance) -> Non
     for _ in range(MAX_FINAL_ROUNDS):
         session.complete(tolerance)
         last = session.adjust("final bundle adjustment", FINAL_ITERATIONS)
-        session.filter(min(MAX_ERROR_PX, tolerance.pixels))
+        session.filter(_final_max_error_px(tolerance))
         if last.max_moved_percent < CONVERGED_PERCENT or not last.accepted:
             return
+
+
+def _final_max_error_px(tolerance: Tolerance) -> float:
+    return min(MAX_ERROR_PX, tolerance.pixels)
 
 
 def _may_zoom(task: RefineTask) -> bool:
@@ -391,11 +401,13 @@ def _longer_side_px(collection: ImageCollection) -> int:
     return int(np.median([max(image.width, image.height) for image in collection.images]))
 
 
-def _without(elsewhere: Collection[int], features: MatchedFeatures) -> MatchedFeatures:
-    """Without matches of images that another scene has, which must not be registered in this one."""
+def _without(images: Collection[int], features: MatchedFeatures) -> MatchedFeatures:
+    """Without matches of these images: another scene has them, or they come later."""
+
+    left_out = set(images)
 
     def kept(matches: Mapping[Pair, npt.NDArray[np.uint32]]) -> dict[Pair, npt.NDArray[np.uint32]]:
-        return {pair: rows for pair, rows in matches.items() if set(pair).isdisjoint(elsewhere)}
+        return {pair: rows for pair, rows in matches.items() if left_out.isdisjoint(pair)}
 
     return replace(features, raw=kept(features.raw), verified=kept(features.verified))
 

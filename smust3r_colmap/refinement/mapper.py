@@ -17,7 +17,7 @@ import pycolmap
 
 from smust3r_colmap.colmap.database import write_colmap_database
 from smust3r_colmap.colmap.reconstruction import cameras_of, poses_of
-from smust3r_colmap.features.guided_verification import MatchedFeatures, View, verify_guided
+from smust3r_colmap.features.guided_verification import MatchedFeatures, View, inlier_fractions, verify_guided
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
@@ -219,15 +219,8 @@ class MapperSession:
 
     # ------------------------------------------------------------------ registration
     def register_missing(self, tolerance: Tolerance) -> None:
-        """Register images without a pose by the points they see.
-
-        Fewer points than COLMAP's minimum suffice, because most matches of the image must agree afterwards.
-        """
-        options = pycolmap.IncrementalMapperOptions()
-        options.random_seed = 0
-        options.num_threads = self.threads
-        options.abs_pose_min_num_inliers = MIN_RESECTION_INLIERS
-        options.abs_pose_refine_focal_length = options.abs_pose_refine_extra_params = False
+        """Register images without a pose by the points they see."""
+        options = self._registration_options()
         found: list[int] = []
         while True:
             candidates = self.mapper.find_next_images(options, False)
@@ -238,6 +231,50 @@ class MapperSession:
             if not new:
                 break
         self.registered = tuple(sorted(i - 1 for i in found))
+
+    def register_between(self, features: MatchedFeatures, images: Sequence[int], max_error_px: float) -> None:
+        """Register images that see what the model's cameras beside them see, such as those between keyframes.
+
+        They get observations of existing points and are adjusted with these points fixed, so that nothing of the model
+        moves and the time is linear in their number.
+
+        Args:
+            features: of the run, with the matches of these images.
+            images: indices into the collection, without a pose. max_error_px: of their observations.
+        """
+        self.features = features
+        self.verify(FINE_TOLERANCE_FRACTION)
+        found = [i + 1 for i in images if self.mapper.register_next_image(self._registration_options(), i + 1)]
+
+        def step() -> bool:
+            return adjust_images(self.model, found, max_iterations=SUBSET_ITERATIONS, threads=self.threads)
+
+        self._try("bundle adjustment of the registered images", step)
+        self.filter(max_error_px)
+        contradicted = self._contradicted(found)
+        for image_id in contradicted:
+            self.mapper.observation_manager.deregister_frame(self.model.image(image_id).frame_id)
+        self.registered = tuple(sorted({*self.registered, *(i - 1 for i in found if i not in contradicted)}))
+
+    def _contradicted(self, image_ids: Sequence[int]) -> set[int]:
+        """Those of the images whose verified matches do not satisfy the epipolar constraint; see ``agrees``."""
+        total, agreeing = dict.fromkeys(image_ids, 0), dict.fromkeys(image_ids, 0.0)
+        fractions = inlier_fractions(self.features, self.views(), tolerance=COARSE_TOLERANCE_FRACTION, min_matches=1)
+        for pair, fraction in fractions.items():
+            for image_id in {pair[0] + 1, pair[1] + 1} & total.keys():
+                matches = len(self.features.verified[pair])
+                total[image_id] += matches
+                agreeing[image_id] += fraction * matches
+        return {i for i in image_ids if agreeing[i] < MIN_AGREEING_FRACTION * max(total[i], 1)}
+
+    def _registration_options(self) -> pycolmap.IncrementalMapperOptions:
+        """Fewer points than COLMAP's minimum suffice, because most matches of the image must agree afterwards."""
+        options = pycolmap.IncrementalMapperOptions()
+        options.random_seed = 0
+        options.num_threads = self.threads
+        options.abs_pose_min_num_inliers = MIN_RESECTION_INLIERS
+        options.abs_pose_refine_focal_length = options.abs_pose_refine_extra_params = False
+        return options
 
     def _register(self, options: pycolmap.IncrementalMapperOptions, image_id: int) -> bool:
         if not self.mapper.register_next_image(options, image_id):

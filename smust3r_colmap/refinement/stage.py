@@ -48,7 +48,7 @@ from smust3r_colmap.storage.run_directory import (
 
 NEXT_IMAGES = 4
 """Neighbours in order that are always matched if the backbone has matched nothing."""
-METHOD_VERSION = 7
+METHOD_VERSION = 8
 """To be raised when the refinement changes, so that finished folders are refined again."""
 WORKERS_PER_THREAD = 2
 """Adjustment gains little from threads: on two cores a second one took 70 % more processor time and saved no time."""
@@ -109,7 +109,8 @@ class InitialScenes:
         maps: depth of the scenes; None if the model has none.
         maps_key: hash of all that the maps were made from.
         view_graph: the order of the images.
-        pairs_of_others: pairs of images without a pose with those that see the same, so that they can be registered.
+        others: images that are no keyframes.
+        pairs_of_others: these with the keyframes beside them, to which they are registered.
         surfaces: (S, 3) world points that each image sees, by image index; by default from the maps, or from the
             points of the scenes.
         tolerance: of the poses, as a fraction of the longer image side.
@@ -118,6 +119,7 @@ class InitialScenes:
     scenes: tuple[Scene, ...]
     subsets: tuple[tuple[int, ...], ...]
     view_graph: ViewGraph
+    others: tuple[int, ...] = ()
     pairs_of_others: tuple[Pair, ...] = ()
     maps: DepthMaps | None = None
     maps_key: str = ""
@@ -132,6 +134,7 @@ class InitialScenes:
             scenes=stitched.scenes,
             subsets=windows,
             view_graph=segments.view_graph,
+            others=segments.others,
             pairs_of_others=segments.pairs_of_others,
             maps=stitched.maps,
             maps_key=maps_key,
@@ -201,7 +204,7 @@ def refine(
         features = features or features_of_run(run, collection, feature_options)
         pairs = _match(run, initial, seen, features, options.track_neighbours)
     map_pairs = () if source == "features" else _pairs_for_maps(initial, seen, options.track_neighbours)
-    settings = (options, collection.calibrated, initial.tolerance, is_network)
+    settings = (options, collection.calibrated, initial.tolerance, is_network, initial.others)
     inputs = (METHOD_VERSION, features and features.key, pairs, initial.geometry, settings, initial.maps_key)
     stored = run.folder.stage(REFINED_STAGE, key=key_of(REFINED_STAGE, inputs))
     with run.clock.stage("refinement", total=1) as stage:
@@ -212,6 +215,7 @@ def refine(
                 stored=stored,
                 collection=collection,
                 scenes=tuple(replace(scene, points=EMPTY_CLOUD) for scene in initial.scenes),
+                others=initial.others,
                 features=None if features is None else features.database,
                 maps=initial.maps if map_pairs else None,
                 map_pairs=map_pairs,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from smust3r_colmap.colmap.database import write_colmap_database
-from smust3r_colmap.features.rotation_consistency import MAX_ROTATION_ERROR_DEG, RotationTask, rotation_errors_deg
+from smust3r_colmap.features.rotation_consistency import MAX_ROTATION_ERROR_DEG, VerifiedPairs, rotation_errors_deg
 from smust3r_colmap.geometry.arrays import Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import ImageCollection, SourceImage
@@ -40,7 +40,7 @@ def seen(cam_from_world: np.ndarray, points_world: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture
-def task(tmp_path: Path) -> RotationTask:
+def task(tmp_path: Path) -> VerifiedPairs:
     rng = np.random.default_rng(0)
     keypoints: list[list[np.ndarray]] = [[] for _ in range(NUM_IMAGES)]
     matches: dict[Pair, np.ndarray] = {}
@@ -78,7 +78,7 @@ def task(tmp_path: Path) -> RotationTask:
         j_from_i={},
         priors=(),
     )
-    return RotationTask(
+    return VerifiedPairs(
         database=tmp_path / "features.db",
         pairs=tuple(sorted(matches)),
         cameras=(CAMERA,),
@@ -87,14 +87,14 @@ def task(tmp_path: Path) -> RotationTask:
     )
 
 
-def test_pairs_between_look_alike_walls_are_far_from_all_others(task: RotationTask) -> None:
+def test_pairs_between_look_alike_walls_are_far_from_all_others(task: VerifiedPairs) -> None:
     errors = dict(zip(task.pairs, rotation_errors_deg(task).tolist(), strict=True))
     assert {pair for pair, error in errors.items() if error > MAX_ROTATION_ERROR_DEG} == set(FALSE)
     for pair in FALSE:
         assert errors[pair] == pytest.approx(180 - 15, abs=5)
 
 
-def test_every_connected_component_is_averaged_by_itself(task: RotationTask) -> None:
+def test_every_connected_component_is_averaged_by_itself(task: VerifiedPairs) -> None:
     left, right = set(range(1, 10)), set(range(13, 22))
     inside = tuple(pair for pair in task.pairs if set(pair) <= left or set(pair) <= right)
     errors = rotation_errors_deg(replace(task, pairs=inside))
@@ -102,5 +102,5 @@ def test_every_connected_component_is_averaged_by_itself(task: RotationTask) -> 
     assert errors.max() < 5
 
 
-def test_no_pairs(task: RotationTask) -> None:
+def test_no_pairs(task: VerifiedPairs) -> None:
     assert rotation_errors_deg(replace(task, pairs=())).shape == (0,)

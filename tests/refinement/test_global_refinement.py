@@ -56,6 +56,7 @@ from smust3r_colmap.refinement.global_refinement import RefineTask, refine_scene
 from smust3r_colmap.refinement.mapper import redundant_points
 from smust3r_colmap.refinement.stage import InitialScenes, Refinement
 from smust3r_colmap.refinement.statistics import MIN_OBSERVATIONS, SceneRefinement, Statistics
+from smust3r_colmap.segmentation.keyframes import pairs_with_keyframes
 from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.storage.run_directory import StageFolder, read_json
 
@@ -126,6 +127,35 @@ def refined(
     made = tuple(stitched_scene(collection, stitched, group) for group in groups)
     results = refine_scenes(replace(refine_task(folder, collection, made), segments=segments))
     return Refined(world=world, collection=collection, stitched=stitched, folder=folder / "refined", results=results)
+
+
+OTHERS, CONTRADICTED, NUM_WRONG = (3, 4, 8, 11), 8, 150
+
+
+@pytest.fixture(scope="module")
+def between_keyframes(tmp_path_factory: pytest.TempPathFactory) -> tuple[Refined, Refined]:
+    """Keyframes alone, and with the images between them, one of which matches more of what it does not see."""
+    rng = np.random.default_rng(5)
+    world = make_world(arc(NUM_IMAGES), ball(220, rng), rng)
+    stitched = disturbed(world.cam_from_world, rng, position=0.006 * world.extent, rotation_deg=0.4)
+    keyframes = [i for i in range(NUM_IMAGES) if i not in OTHERS]
+    matches = {pair: true_matches(world, pair) for pair in pairs_within(keyframes, REACH)}
+    of_others = {pair: true_matches(world, pair) for pair in pairs_with_keyframes(NUM_IMAGES, OTHERS)}
+    after = (CONTRADICTED, CONTRADICTED + 1)
+    of_others[CONTRADICTED - 1, CONTRADICTED] = of_others[CONTRADICTED - 1, CONTRADICTED][: NUM_WRONG // 2]
+    of_others[after] = wrong_matches(world, after, NUM_WRONG, rng)
+    found = []
+    for name, others in (("alone", ()), ("all", OTHERS)):
+        folder = tmp_path_factory.mktemp(name)
+        collection = make_collection(folder, NUM_IMAGES)
+        verified = {**matches, **(of_others if others else {})}
+        write_features(folder / "features.db", collection, world, verified=verified)
+        task = refine_task(folder, collection, (stitched_scene(collection, stitched, keyframes),))
+        results = refine_scenes(replace(task, others=others))
+        found.append(
+            Refined(world=world, collection=collection, stitched=stitched, folder=folder / "refined", results=results)
+        )
+    return found[0], found[1]
 
 
 def num_right(world: World, pair: Pair, rows: Rows) -> int:
@@ -833,3 +863,30 @@ def test_surface_of_an_image_is_the_nearest_of_the_cloud_in_every_cell() -> None
         towards = world.centres[i] / np.linalg.norm(world.centres[i])
         assert 15 < len(points) <= GRID_CELLS**2
         assert (points @ towards > 0).mean() > 0.9, "the far side of the ball is hidden"
+
+
+# ------------------------------------------------------------------- between keyframes
+def test_images_between_keyframes_are_registered_where_they_are(between_keyframes: tuple[Refined, Refined]) -> None:
+    _, complete = between_keyframes
+    (result,) = complete.results
+    right = [i for i in OTHERS if i != CONTRADICTED]
+    assert result.registered == complete.names(*right)
+    assert set(complete.model().reg_image_ids()) == {i + 1 for i in range(NUM_IMAGES) if i != CONTRADICTED}
+    poses = poses_of(complete.model())
+    at = sorted(poses)
+    truth = centres_of(complete.world.cam_from_world[at])
+    _, placed = fitted(centres_of(np.stack([poses[i] for i in at])), truth)
+    distance = np.linalg.norm(placed - truth, axis=1)
+    assert distance[[at.index(i) for i in right]].max() < 0.002 * complete.world.extent
+
+
+def test_keyframes_do_not_move_for_the_images_between_them(between_keyframes: tuple[Refined, Refined]) -> None:
+    alone, complete = (one.model() for one in between_keyframes)
+    for image_id in alone.reg_image_ids():
+        np.testing.assert_array_equal(
+            complete.image(image_id).cam_from_world().matrix(), alone.image(image_id).cam_from_world().matrix()
+        )
+    assert complete.camera(1).params.tolist() == alone.camera(1).params.tolist()
+    assert complete.num_points3D() == alone.num_points3D()
+    seen = [complete.image(i + 1).num_points3D for i in OTHERS if i != CONTRADICTED]
+    assert min(seen) > MIN_OBSERVATIONS

@@ -35,7 +35,12 @@ from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.execution.task_pool import TaskFailure
 from smust3r_colmap.features.pairs import plan_loop_pairs, plan_pairs
-from smust3r_colmap.features.stage import describe_images, features_of_run, match_pairs_of_run
+from smust3r_colmap.features.stage import (
+    cross_validated_cameras_of_run,
+    describe_images,
+    features_of_run,
+    match_pairs_of_run,
+)
 from smust3r_colmap.geometry.arrays import Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import (
@@ -147,8 +152,9 @@ class ClassicalBackbone:
         if self.collection.calibrated:
             mapped = self._map_all("mapping", list(tasks.values()))
             return [mapped[segment.index] for segment in segments]
-        windows = [tasks[segment.index] for segment in segments if segment.kind != "loop"]
-        mapped = self._self_calibrated(windows)
+        starts = self._start_cameras([tasks[segment.index] for segment in segments if segment.kind != "loop"])
+        tasks = {index: replace(task, cameras=starts) for index, task in tasks.items()}
+        mapped = self._self_calibrated([tasks[segment.index] for segment in segments if segment.kind != "loop"])
         known = self._agreed_cameras(segments, mapped)
         rest = [
             replace(tasks[segment.index], known_cameras=known[segment.kind])
@@ -176,6 +182,11 @@ class ClassicalBackbone:
         ]
         mapped |= self._calibrate_all(calibrations)
         return [mapped[segment.index] for segment in segments]
+
+    def _start_cameras(self, windows: Sequence[MappingTask]) -> tuple[Intrinsics, ...]:
+        """By camera index. Only pairs of the calibration segments tell, so images appended later change nothing."""
+        pairs = {pair for task in choose_calibration_segments(windows) for pair in task.pairs}
+        return cross_validated_cameras_of_run(self.run, self._features, self.collection, pairs)
 
     def _self_calibrated(self, windows: Sequence[MappingTask]) -> dict[int, MappedSegment]:
         """Windows mapped with free cameras, by segment: the calibration segments, or all where these disagree."""
@@ -234,6 +245,7 @@ class ClassicalBackbone:
             task.images,
             task.pairs,
             task.view_graph.pairs,
+            task.cameras,
             sorted(task.known_cameras.items()),
         )
         return key_of("mapping", METHOD_VERSION, *inputs)

@@ -64,7 +64,7 @@ CLEARLY_MORE_RATIO = 1.05
 """Earlier strategies are stricter: a later one has to register more images by this factor."""
 MIN_NEW_SHARE_OF_BEST, MIN_NEW_SHARE_OF_OTHERS = 0.1, 0.3
 """Share of a model's images that no larger model has, for it to be kept: of the best strategy, of the others."""
-METHOD_VERSION = 3
+METHOD_VERSION = 4
 """To be raised when mapping or calibration change, so that finished segments are mapped again."""
 
 
