@@ -26,8 +26,10 @@ from smust3r_colmap.geometry.camera import Intrinsics
 
 MAX_DIFFERENCE_RATIO = 0.05
 """Between the focal lengths of two halves. They differ by 0.1 to 4 % where both are within 5 % of the truth, and by
-7 % or more where they are not: simulated arcs and straight lines, ``castle_p30``, ``courthouse_walk``, ``lund_street``,
-``kitti_a``."""
+7 % or more where they are not: simulated arcs and straight lines, ``castle_p30``, ``courthouse_walk``,
+``lund_street``."""
+UNCHANGED_RATIO = 1e-3
+"""Within this of the guess, the pairs told nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +57,8 @@ def cross_validated_cameras(verified: VerifiedPairs) -> tuple[Intrinsics, ...]:
     cameras = []
     for guess, *found in zip(verified.cameras, *halves, strict=True):
         focal_px = [one.focal_px for one in found]
-        agree = max(focal_px) <= (1 + MAX_DIFFERENCE_RATIO) * min(focal_px)
+        told = min(abs(one / guess.focal_px - 1) for one in focal_px) > UNCHANGED_RATIO
+        agree = told and max(focal_px) <= (1 + MAX_DIFFERENCE_RATIO) * min(focal_px)
         cameras.append(guess.zoomed(sqrt(focal_px[0] * focal_px[1]) / guess.focal_px) if agree else guess)
     return tuple(cameras)
 
