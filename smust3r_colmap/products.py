@@ -50,6 +50,7 @@ class SourceImage:
         mask: what of it is to be used; None for all.
         bits: of each channel, that all images of its camera are scaled by if they have more than 8; None looks at the
             file alone.
+        is_keyframe: it carries the reconstruction; others are registered to the finished model.
     """
 
     name: str
@@ -61,6 +62,7 @@ class SourceImage:
     timestamp_s: float | None = None
     mask: ImageMask | None = None
     bits: int | None = None
+    is_keyframe: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)

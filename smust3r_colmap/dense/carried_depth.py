@@ -72,7 +72,8 @@ def _by_depth(depth: FloatArray, confidence: FloatMap) -> npt.NDArray[np.uint64]
     Positive floating-point numbers have the order of their bits.
     """
     high, low = (np.ascontiguousarray(one, dtype=np.float32).view(np.uint32) for one in (depth, confidence))
-    return (high.astype(np.uint64) << np.uint64(32)) | low
+    both: npt.NDArray[np.uint64] = (high.astype(np.uint64) << np.uint64(32)) | low
+    return both
 
 
 def _points_in(view: DepthView, cam_from_world: FloatArray) -> tuple[FloatArray, FloatMap]:

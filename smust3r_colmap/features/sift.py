@@ -30,6 +30,12 @@ logger = logging.getLogger(__name__)
 _SPARSE_PEAK_THRESHOLD = 0.002
 """Second try for images that gave fewer than a quarter of the features allowed (COLMAP's own is 0.0067)."""
 
+MIN_FEATURES_BETWEEN_KEYFRAMES, MAX_FEATURES_BETWEEN_KEYFRAMES = 500, 2000
+"""Of images that are no keyframes and only need a pose: found at full size and below, a fifth of the time. Where there
+are too few, they get as many as a keyframe."""
+METHOD_BETWEEN_KEYFRAMES = 1
+"""To be raised when the features of these images change."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class _ExtractionTask:
@@ -105,7 +111,11 @@ def _extract(task: _ExtractionTask) -> _Features:
         small = grey
     kept = None if task.image.mask is None else load_mask(task.image.mask.path, task.image) > 0
     shrunk = (grey.shape[1] / small.shape[1], grey.shape[0] / small.shape[0])
-    features = _unmasked(_enlarged(_sift(small, task.max_features, peak_threshold=None), *shrunk), kept)
+    if not task.image.is_keyframe:
+        few = _unmasked(_enlarged(_sift(small, MAX_FEATURES_BETWEEN_KEYFRAMES, first_octave=0), *shrunk), kept)
+        if len(few.keypoints) >= MIN_FEATURES_BETWEEN_KEYFRAMES:
+            return few
+    features = _unmasked(_enlarged(_sift(small, task.max_features), *shrunk), kept)
     if len(features.keypoints) < task.max_features // 4:
         more = _sift(small, task.max_features, peak_threshold=_SPARSE_PEAK_THRESHOLD)
         features = _unmasked(_enlarged(more, *shrunk), kept)
@@ -129,13 +139,21 @@ def _unmasked(features: _Features, kept: npt.NDArray[np.bool_] | None) -> _Featu
     return _Features(keypoints=features.keypoints[there], descriptors=features.descriptors[there])
 
 
-def _sift(grey: npt.NDArray[np.uint8], max_features: int, *, peak_threshold: float | None) -> _Features:
+def _sift(
+    grey: npt.NDArray[np.uint8],
+    max_features: int,
+    *,
+    peak_threshold: float | None = None,
+    first_octave: int | None = None,
+) -> _Features:
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = 1
     options.use_gpu = False
     options.sift.max_num_features = max_features
     if peak_threshold is not None:
         options.sift.peak_threshold = peak_threshold
+    if first_octave is not None:
+        options.sift.first_octave = first_octave
     extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
     keypoints, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(grey))
     matrix = np.asarray(pycolmap.keypoints_to_matrix(keypoints), dtype=np.float32).reshape(-1, 4).copy()

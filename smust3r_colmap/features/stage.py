@@ -25,7 +25,7 @@ from smust3r_colmap.features.rotation_consistency import (
     METHOD_VERSION,
     rotation_errors_deg,
 )
-from smust3r_colmap.features.sift import extract_features
+from smust3r_colmap.features.sift import METHOD_BETWEEN_KEYFRAMES, extract_features
 from smust3r_colmap.features.stationary import NO_REGIONS, StaticRegions, describe
 from smust3r_colmap.features.view_graph_calibration import VerifiedPairs, cross_validated_cameras
 from smust3r_colmap.features.vlad import FEATURES_PER_IMAGE, vlad_descriptors
@@ -52,7 +52,11 @@ def feature_database_of_run(run: Run, collection: ImageCollection, options: Feat
     images = [(image.digest, image.width, image.height, image.camera) for image in collection.images]
     settings = (options.max_image_size, options.max_features, run.seed)
     masks = (collection.mask_digests,) if collection.mask_digests else ()
-    stored = run.folder.stage("features", key=key_of("features", images, collection.cameras, *settings, *masks))
+    others = [k for k, image in enumerate(collection.images) if not image.is_keyframe]
+    between = (METHOD_BETWEEN_KEYFRAMES, others) if others else ()
+    stored = run.folder.stage(
+        "features", key=key_of("features", images, collection.cameras, *settings, *masks, *between)
+    )
     database = stored.open_in_place() / "database.db"
     there = database.stat().st_size if database.exists() else 0
     run.folder.check_space("the features", len(collection) * options.max_features * _BYTES_PER_FEATURE - there)

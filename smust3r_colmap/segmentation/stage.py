@@ -94,6 +94,26 @@ class Segments:
         )
 
 
+def with_keyframes(run: Run, collection: ImageCollection, config: RunConfig) -> ImageCollection:
+    """The collection that says which images are keyframes: all of them where nothing would register the others."""
+    options = config.segmentation
+    if not config.refinement.refine:
+        return collection
+
+    def compute(progress: Stage) -> tuple[int, ...]:
+        chosen = choose_keyframes(collection.images, options.keyframes, segment_length=options.segment_length)
+        progress.advance()
+        return chosen
+
+    inputs = ([image.digest for image in collection.images], options.keyframes, options.segment_length)
+    keyframes = run.cached("keyframes", inputs, compute, _KEYFRAMES)
+    if len(keyframes) < len(collection):
+        run.clock.note(f"{len(keyframes)} of {len(collection)} images are keyframes; the others are registered to them")
+    chosen = set(keyframes)
+    images = (replace(image, is_keyframe=k in chosen) for k, image in enumerate(collection.images))
+    return replace(collection, images=tuple(images))
+
+
 def plan(
     run: Run,
     collection: ImageCollection,
@@ -108,8 +128,8 @@ def plan(
     Raises:
         CollectionError: no three images match each other.
     """
-    keyframes = _keyframes(run, collection, config)
-    others = tuple(sorted({*range(len(collection))} - {*keyframes}))
+    keyframes = [k for k, image in enumerate(collection.images) if image.is_keyframe]
+    others = tuple(k for k, image in enumerate(collection.images) if not image.is_keyframe)
     describe = cache(describe)
     options = config.segmentation
     is_long = options.order == "auto" and len(keyframes) > config.features.exhaustive_below
@@ -121,24 +141,6 @@ def plan(
     else:
         segments = _of_view_graph(run, collection, order.chain, others, describe, config)
     return replace(segments, order=order.reason)
-
-
-def _keyframes(run: Run, collection: ImageCollection, config: RunConfig) -> tuple[int, ...]:
-    """Chosen once in the run; all images where nothing would register the others."""
-    options = config.segmentation
-    if not config.refinement.refine:
-        return tuple(range(len(collection)))
-
-    def compute(progress: Stage) -> tuple[int, ...]:
-        chosen = choose_keyframes(collection.images, options.keyframes, segment_length=options.segment_length)
-        progress.advance()
-        return chosen
-
-    inputs = ([image.digest for image in collection.images], options.keyframes, options.segment_length)
-    keyframes = run.cached("keyframes", inputs, compute, _KEYFRAMES)
-    if len(keyframes) < len(collection):
-        run.clock.note(f"{len(keyframes)} of {len(collection)} images are keyframes; the others are registered to them")
-    return keyframes
 
 
 def _without(descriptors: Float32Array, others: Sequence[int]) -> Float32Array:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from smust3r_colmap.colmap.database import write_colmap_database
-from smust3r_colmap.features.rotation_consistency import MAX_ROTATION_ERROR_DEG, VerifiedPairs, rotation_errors_deg
+from smust3r_colmap.features.rotation_consistency import MAX_ROTATION_ERROR_DEG, rotation_errors_deg
+from smust3r_colmap.features.view_graph_calibration import VerifiedPairs
 from smust3r_colmap.geometry.arrays import Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import ImageCollection, SourceImage
