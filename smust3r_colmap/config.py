@@ -83,7 +83,7 @@ class SegmentationConfig:
     their likeness, folder by folder."""
     keyframes: int | Literal["auto", "all"] = "all"
     """Images that carry the reconstruction: all of them, so many, or those between which a video moves enough (auto).
-    The others are registered to the refined model, which may take long where they are many."""
+    The others are registered to the finished model."""
     segment_length: int = 60
     """Images per segment (l); the paper's setting."""
     overlap: int = 20
