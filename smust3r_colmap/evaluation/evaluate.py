@@ -38,7 +38,7 @@ MIN_COMPARED = 3
 _LINE = 1e-6
 """Relative width of centres that are on a line but for rounding."""
 _MAX_IMAGES_IN_PAIRS = 10_000
-"""All pairs of more would take minutes, and gigabytes."""
+"""All pairs of more would take minutes."""
 _MAX_DEPTHS = 20_000_000
 """More pixels are thinned evenly: their ratios are held in memory for the median."""
 _SUSPECT_DEG, _SUSPECT_FACTOR = 5.0, 5.0
@@ -154,8 +154,8 @@ def evaluate(
         estimate=_described(first),
         reference=_described(reference),
         rows=tuple(rows),
-        notes=tuple(_notes(models, reference)),
-        warnings=(*first.notes, *reference.notes, *_warnings(compared, first, reference)),
+        notes=tuple(_notes(models, reference, workspace)),
+        warnings=(*first.notes, *reference.notes, *_missing(rows), *_warnings(compared, first, reference)),
     )
 
 
@@ -187,12 +187,19 @@ def _described(poses: PoseSet) -> str:
     return f"{poses.place} ({poses.layout}, {len(poses)} poses)"
 
 
-def _notes(models: Sequence[PoseSet], reference: PoseSet) -> Iterator[str]:
+def _missing(rows: Sequence[Row]) -> tuple[str, ...]:
+    """Why figures are missing."""
+    return tuple(dict.fromkeys(f"{row.metric}: {row.note}" for row in rows if None in row.values.values()))
+
+
+def _notes(models: Sequence[PoseSet], reference: PoseSet, workspace: DenseWorkspace | None) -> Iterator[str]:
     if len(models) > 1:
         others = ", ".join(f"{model.place.name} ({len(model)} poses)" for model in models[1:])
         yield f"figures are those of the largest model; auc_colmap, by image names, counts the others, too: {others}"
     if reference.is_model:
         yield "the reference is a reconstruction: its errors count as errors of the estimate"
+    if workspace is not None and reference.depth is not None and reference.depth.intrinsics is None:
+        yield "the depth of the reference is not compared: its layout has no intrinsics"
 
 
 # --------------------------------------------------------------------------- absolute
@@ -213,7 +220,9 @@ def _absolute(compared: _Compared) -> Iterator[Row]:
         "aae",
         _NO_STATISTICS if is_line else angles,
         "deg",
-        note="not determined: the centres are on a line" if is_line else "orientations after the fit of the centres",
+        note="not determined: the centres are on a line, which leaves the rotation about it free"
+        if is_line
+        else "orientations after the fit of the centres",
     )
     try:
         turned = align_rotations(compared.estimated, compared.reference)
@@ -235,9 +244,9 @@ def _scale(compared: _Compared) -> Row:
 
 
 def _warnings(compared: _Compared, *sides: PoseSet) -> Iterator[str]:
-    if compared.options.align != "none" and compared.width < MIN_RELATIVE_WIDTH:
+    if compared.options.align != "none" and _LINE <= compared.width < MIN_RELATIVE_WIDTH:
         yield (
-            f"the compared centres are {'' if compared.width < _LINE else 'nearly '}on a line (width "
+            f"the compared centres are nearly on a line (width "
             f"{100 * compared.width:.2g} % of the length), so that they do not determine the rotation about it: aae is "
             "not to be believed; aae_rotation_aligned does not depend on it"
         )
@@ -381,9 +390,10 @@ def _depth(compared: _Compared, workspace: DenseWorkspace, truth: DepthFiles) ->
     names, names_ref = workspace.names, tuple(truth.files)
     matched = match_names(names, names_ref)
     pairs = [(names[a], truth.files[names_ref[b]]) for a, b in zip(matched.estimate, matched.reference, strict=True)]
-    if truth.intrinsics is None or not pairs:
-        why = "no image has both a map and depth in the reference" if not pairs else "its layout has no intrinsics"
-        yield compared.row("depth", {"abs_rel": None}, "", note=f"depth of the reference is not compared: {why}")
+    if truth.intrinsics is None:
+        return
+    if not pairs:
+        yield compared.row("depth", {"abs_rel": None}, "", note="no image has both a map and depth in the reference")
         return
     registration = compared.options.depth_registration
     num_pixels = sum(workspace.camera(name).width * workspace.camera(name).height for name, _ in pairs)
