@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from smust3r_colmap.cli.console import reporting, tell
-from smust3r_colmap.config import FeatureConfig, RunConfig, SegmentationConfig
+from smust3r_colmap.config import FeatureConfig, OutputConfig, RunConfig, SegmentationConfig
 from smust3r_colmap.errors import InputError
 from smust3r_colmap.execution.progress import Reporter
 from smust3r_colmap.report.summary import EXIT_DEGRADED
@@ -22,6 +22,10 @@ _DEMO_SETTINGS = RunConfig(
     features=FeatureConfig(max_features=1500),
     segmentation=SegmentationConfig(segment_length=20, overlap=10),  # enough segments for a loop
 )
+# Errors of check points of the survey, in pixels on the ground, above which something is broken; a third of a pixel
+# in the plane and half a pixel in height are usual.
+_SURVEY_MAX_PIXELS = (1.0, 2.0)
+_SURVEY_SETTINGS = RunConfig(output=OutputConfig(trainer=False, dense=False))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +36,9 @@ class Demo:
     """Folder for the images, the truth and the result."""
     num_images: int = 80
     """Images on the way round the room."""
+    survey: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Render a flight over hills instead, and georeference it: 28 images, 8 control and 12 check points. Needs the
+    extra geo."""
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the figures, warnings and errors only."""
     verbose: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -41,7 +48,35 @@ class Demo:
 def run_demo(command: Demo) -> int:
     """Render, reconstruct, compare; the exit code."""
     with reporting(quiet=command.quiet, verbose=command.verbose) as reporter:
-        return _demo(command, reporter)
+        return _survey(command, reporter) if command.survey else _demo(command, reporter)
+
+
+def _survey(command: Demo, reporter: Reporter) -> int:
+    from smust3r_colmap.exporters.geo_files import write_georeference  # noqa: PLC0415  (heavy: --help needs none)
+    from smust3r_colmap.georeferencing.stage import GeoreferenceSettings, georeference_model  # noqa: PLC0415
+    from smust3r_colmap.pipeline import reconstruct  # noqa: PLC0415
+    from smust3r_colmap.report.georeference_table import render_georeference  # noqa: PLC0415
+    from smust3r_colmap.synthetic.survey import GCP_FILE, PIXEL_M, write_survey  # noqa: PLC0415
+
+    images, result, points = (command.output / name for name in ("images", "result", GCP_FILE))
+    if images.exists() and not points.exists():
+        raise InputError(f"{command.output}: has images that are no survey; name another folder with --output")
+    if not points.exists():
+        reporter.note(f"rendering a survey into {images}")
+        write_survey(command.output)
+    summary = reconstruct(images, result, _SURVEY_SETTINGS, reporter=reporter)
+    tell(summary, reporter, quiet=command.quiet)
+    found = georeference_model(result, images, GeoreferenceSettings(gcp=(points,)))
+    write_georeference(found, result / "geo")
+    print(render_georeference(found))
+    for text in (*found.faults, *found.warnings):
+        reporter.note(text)
+    check = found.accuracies().get("check")
+    horizontal, vertical = _SURVEY_MAX_PIXELS
+    if check is None or check.horizontal > horizontal * PIXEL_M or check.rmse[2] > vertical * PIXEL_M:
+        reporter.warn(f"the check points are not within {horizontal:g} and {vertical:g} pixels: the result is wrong")
+        return EXIT_DEGRADED
+    return summary.exit_code
 
 
 def _demo(command: Demo, reporter: Reporter) -> int:
