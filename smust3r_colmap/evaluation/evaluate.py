@@ -42,7 +42,7 @@ _MAX_IMAGES_IN_PAIRS = 10_000
 _MAX_DEPTHS = 20_000_000
 """More pixels are thinned evenly: their ratios are held in memory for the median."""
 _SUSPECT_DEG, _SUSPECT_FACTOR = 5.0, 5.0
-"""Orientations that are off by so much, and agree so many times better with the quaternion in another order."""
+"""Orientations that are off by so much, and agree so many times better in another order or after another rotation."""
 
 Values = Mapping[str, float | None]
 _NO_STATISTICS: Values = dict.fromkeys(one.name for one in fields(Statistics))
@@ -252,6 +252,13 @@ def _warnings(compared: _Compared, *sides: PoseSet) -> Iterator[str]:
         )
     try:
         errors_deg = _rotation_error_deg(compared.estimated, compared.reference)
+        after_fit_deg = float(rotation_errors_deg(compared.aligned, compared.reference).mean())
+        is_fit = compared.options.align != "none" and compared.width >= MIN_RELATIVE_WIDTH
+        if is_fit and _SUSPECT_DEG < after_fit_deg > _SUSPECT_FACTOR * errors_deg:
+            yield (
+                f"aae ({after_fit_deg:.3g} deg in the mean) is mostly that of the alignment: the orientations agree to "
+                f"{errors_deg:.3g} deg after a rotation of their own, which aae_rotation_aligned has"
+            )
         for side, poses in zip(sides, (compared.estimated, compared.reference), strict=True):
             other = compared.reference if poses is compared.estimated else compared.estimated
             swapped_deg = _rotation_error_deg(_scalar_first(poses), other)

@@ -158,6 +158,17 @@ def test_centres_nearly_on_a_line_are_warned_of() -> None:
     assert evaluate([estimate], reference, EvaluateConfig(align="none")).warnings == ()
 
 
+def test_an_angle_that_is_the_alignments_is_warned_of() -> None:
+    """A camera that turns on the spot: its centres are noise, so that their fit says nothing of the rotation."""
+    rng = np.random.default_rng(4)
+    reference, estimate = (pose_set(0.01 * rng.normal(size=(12, 3))) for _ in range(2))
+    found = evaluate([estimate], reference, EvaluateConfig())
+    assert value(found, "aae", "mean") > 10
+    assert value(found, "aae_rotation_aligned", "max") == pytest.approx(0, abs=1e-5)
+    assert len(found.warnings) == 1
+    assert "is mostly that of the alignment" in found.warnings[0]
+
+
 def test_orientations_do_not_matter_for_the_position_of_a_straight_path_and_do_for_its_cloud() -> None:
     line = on_a_line(1e-5)
     cloud = np.array([[0.0, 3, 0], [5, 0, 3], [9, -2, 1]])
