@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,7 @@ from smust3r_colmap.report.verdict import FAILED_PERCENT, MAX_REASONS, Level, Re
 from smust3r_colmap.storage.run_directory import REFINED_STAGE, RunDirectory, read_json, storage_errors
 
 SETTINGS_FILE = "config.toml"
+GEO_FILE = "geo/geo.json"
 FEATURES = Path("work/features/database.db")
 MAX_THUMBNAILS = 400
 MAX_CAMERAS = 4
@@ -119,6 +120,7 @@ class ReportFacts:
         summary: what ``summary.json`` says, or what can be said of a model alone, in the same form.
         images: in natural order of their names. thumbnails_note: why some have no picture, or empty.
         model: the largest; None where none came out.
+        geo: what ``geo/geo.json`` says; empty where the run was not georeferenced.
         products: files and folders beside the report.
         settings: the settings file, or empty.
         versions: of what wrote the report.
@@ -134,6 +136,7 @@ class ReportFacts:
     products: tuple[str, ...]
     settings: str
     versions: Mapping[str, str]
+    geo: Mapping[str, Any] = field(default_factory=dict)
 
 
 # ------------------------------------------------------------------------------- runs
@@ -174,6 +177,7 @@ def facts_of_run(root: Path, images: Path | None) -> ReportFacts:
         num_more_reasons=len(summary["weak_reasons"]) - len(reasons),
         summary=summary,
         model=facts,
+        geo=read_json(root / GEO_FILE) if (root / GEO_FILE).is_file() else {},
         products=_products(root),
         settings=settings,
         versions=_versions(),

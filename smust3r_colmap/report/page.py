@@ -58,6 +58,7 @@ def render(facts: ReportFacts) -> str:
         _loops(facts.summary),
         _models(facts.summary),
         _cost(facts.summary),
+        _georeference(facts.geo),
         _products(facts),
         _settings(facts),
     ]
@@ -222,6 +223,29 @@ def _cost(summary: Mapping[str, Any]) -> Markup:
     rows.append((tag("b", "all"), "", tag("b", format_seconds(wall_s)), tag("b", format_seconds(cpu_s))))
     memory = f"The largest process took {summary['peak_memory_bytes'] / 2**30:.1f} GiB of memory."
     return section("cost", "Cost", table(("stage", "", "time", "processor time"), rows), paragraph(memory))
+
+
+def _georeference(geo: Mapping[str, Any]) -> Markup:
+    """Where on earth the model is, and how far the survey is from it."""
+    if not geo:
+        return Markup("")
+    crs = "coordinates of a site"
+    if geo["crs"] is not None:
+        code = f"EPSG:{geo['crs']['epsg']} ({geo['crs']['name']})" if geo["crs"]["epsg"] else geo["crs"]["name"]
+        crs = f"{code}, vertical datum: {geo['crs']['vertical']}"
+    said = f"{sentence(crs)} One unit of the model is {number(geo['metres_per_unit'], 6)} m. Placed by {geo['basis']}."
+    rows = [
+        (
+            name.replace("_", " "),
+            one["count"],
+            *(f"{value:.3f}" if value is not None else "-" for value in one["rmse"]),
+            *(f"{one[key]:.3f}" if one[key] is not None else "-" for key in ("horizontal", "spatial", "ce90", "le90")),
+        )
+        for name, one in geo["accuracy_m"].items()
+    ]
+    head = ("surveyed less computed, m", "n", "RMSE x", "y", "z", "horizontal", "3D", "CE90", "LE90")
+    notes = [paragraph(sentence(note)) for key in ("faults", "warnings") for note in geo[key]]
+    return section("georeference", "Georeference", paragraph(said), table(head, rows), *notes)
 
 
 def _products(facts: ReportFacts) -> Markup:

@@ -281,6 +281,28 @@ def test_wrong_use_is_refused(run: Path, words: list[str], message: str, capsys:
     assert message in capsys.readouterr().err
 
 
+def test_where_the_model_is_on_earth_is_shown(run: Path, tmp_path: Path) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    accuracy = {"count": 6, "mean": [0, 0, 0], "rmse": [0.004, 0.008, None], "horizontal": 0.009, "spatial": None}
+    geo = {
+        "crs": {"name": "ETRS89 / UTM zone 32N", "epsg": 25832, "vertical": "unknown"},
+        "metres_per_unit": 7.301256,
+        "basis": "control points",
+        "accuracy_m": {"control_leave_one_out": {**accuracy, "ce90": 0.013, "le90": None}},
+        "faults": [],
+        "warnings": ["heights <were> not used"],
+    }
+    (tmp_path / "run/geo").mkdir()
+    write_json(tmp_path / "run/geo/geo.json", geo)
+    assert main(["report", str(tmp_path / "run")]) == 0
+    page = Page(tmp_path / "run/report.html")
+    assert "EPSG:25832 (ETRS89 / UTM zone 32N), vertical datum: unknown." in page.text
+    assert "One unit of the model is 7.30126 m. Placed by control points." in page.text
+    assert "control leave one out60.0040.008-0.009-0.013-" in page.text
+    assert "Heights <were> not used." in page.text
+    assert {"href": "geo/geo.json"} in page.all_of("a")
+
+
 # ------------------------------------------------------------------------- a model alone
 def test_a_model_with_its_database_has_a_verdict(run: Path, tmp_path: Path) -> None:
     target = tmp_path / "out.html"
