@@ -15,6 +15,8 @@ import tyro
 from smust3r_colmap.errors import ConfigError, InputError
 from smust3r_colmap.report.summary import EXIT_GOOD
 
+_HEAD_BYTES = 2000
+
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
@@ -44,7 +46,7 @@ def run_report(command: Report) -> int:
         RunLockedError: the run is still going on.
         RunDirectoryError, StorageError: a file of the run cannot be read, or the report cannot be written.
     """
-    from smust3r_colmap.report.html import REPORT_FILE  # noqa: PLC0415  (heavy: --help shall not pay for it)
+    from smust3r_colmap.report.html import GENERATOR, REPORT_FILE  # noqa: PLC0415  (heavy: --help shall not pay for it)
 
     if command.images is not None and not command.images.is_dir():
         raise InputError(f"--images {command.images}: no such folder")
@@ -54,6 +56,8 @@ def run_report(command: Report) -> int:
     target = command.output or (root / REPORT_FILE if is_run else Path(REPORT_FILE))
     if target.is_dir():
         raise ConfigError(f"--output {target}: is a folder; name a file, such as {target / REPORT_FILE}")
+    if target.is_file() and GENERATOR not in target.read_bytes()[:_HEAD_BYTES]:
+        raise InputError(f"{target}: is there already, and no report of ours; name another file with --output")
     if not is_run:
         _report_model(command, target)
     elif command.database is not None:

@@ -111,10 +111,11 @@ def parameter_covariance(linear: LinearisedModel, *, max_nodes: int = MAX_NODES)
     _, information = _eliminated(scaled, bases, body_of, width)
     size = width * (int(body_of[-1]) + 1)
     information[np.arange(size), np.arange(size)] += 1 / UNBOUNDED**2
-    diagonal = np.diagonal(information)[size:]
-    information[np.arange(size, len(information)), np.arange(size, len(information))] += np.where(
-        diagonal > 0, 1e-12 * diagonal, 1
-    )
+    lengths = np.zeros((linear.num_cameras, len(units)))
+    np.add.at(lengths, linear.cameras[linear.image_of], (scaled.by_distortion**2).sum(axis=1))
+    # A parameter that is not determined gets a million times the sigma that it had if all else were known.
+    priors = np.where(lengths > 0, 1e-12 * lengths / linear.noise_px**2, 1).ravel()
+    information[np.arange(size, len(information)), np.arange(size, len(information))] += priors
     coupling = information[:size, size:]
     factor = cho_factor(information[:size, :size], lower=True, check_finite=False)
     reduced = information[size:, size:] - coupling.T @ cho_solve(factor, coupling, check_finite=False)

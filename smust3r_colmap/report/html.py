@@ -23,6 +23,8 @@ from smust3r_colmap.report.page import render
 from smust3r_colmap.storage.atomic_write import write_atomically
 
 REPORT_FILE = "report.html"
+GENERATOR = b'<meta name="generator" content="smust3r-colmap">'
+"""In the head of every report; a file without it is somebody else's."""
 
 
 @dataclass(frozen=True, kw_only=True)

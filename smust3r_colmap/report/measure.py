@@ -169,7 +169,8 @@ def camera_facts(
         )
         sigmas = np.full(len(camera.params), np.nan)
         covariance = covariances.get(one, np.zeros((0, 0)))
-        scale = np.sqrt(np.diag(covariance))
+        variances = np.diag(covariance)
+        scale = np.sqrt(np.where(variances > 0, variances, np.nan))  # not determined at all, but for rounding
         if len(scale):
             sigmas[list(free[one])] = scale
         facts.append(

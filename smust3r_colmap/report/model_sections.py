@@ -315,7 +315,7 @@ def _camera(camera: CameraFacts) -> Markup:
 
 
 def _correlation(value: float, *, is_own: bool) -> Markup:
-    text = f"{value:.2f}"
+    text = f"{value:.2f}" if np.isfinite(value) else "-"
     return tag("b", text) if abs(value) >= STRONG_CORRELATION and not is_own else escaped(text)
 
 

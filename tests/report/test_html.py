@@ -227,6 +227,19 @@ def test_without_work_the_matches_of_the_database_are_taken(run: Path, tmp_path:
     assert "No thumbnails: it is not known where the images are (--images)." in page.text
 
 
+def test_a_report_replaces_a_report_and_nothing_else(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "report.html"
+    target.write_text("<html>mine</html>")
+    assert main(["report", str(run), "--output", str(target)]) == 2
+    assert "report.html: is there already, and no report of ours" in capsys.readouterr().err
+    assert target.read_text() == "<html>mine</html>"
+    target.unlink()
+    assert main(["report", str(run), "--output", str(target)]) == 0
+    assert main(["report", str(run), "--output", str(target)]) == 0
+
+
 def test_a_run_without_tracks_is_shown(run: Path, tmp_path: Path) -> None:
     root = tmp_path / "run"
     shutil.copytree(run, root)

@@ -68,6 +68,14 @@ def test_a_principal_point_in_the_middle_is_fixed_and_the_others_have_sigmas() -
     assert camera.num_images == 8
 
 
+def test_what_images_at_one_place_leave_open_has_no_sigma() -> None:
+    rng = np.random.default_rng(4)
+    world = make_world(arc(2), ball(200, rng), rng)
+    one = model_with_true_tracks(world, np.repeat(world.cam_from_world[:1], 2, axis=0), rng, noise=0)
+    (camera,) = camera_facts(one, observe(one), calibrated=False, at_most=4)
+    assert not np.isfinite(camera.sigmas[0]) or camera.sigmas[0] > 10
+
+
 def test_given_cameras_have_no_sigmas() -> None:
     one = model()
     (camera,) = camera_facts(one, observe(one), calibrated=True, at_most=4)
