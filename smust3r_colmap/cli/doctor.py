@@ -39,11 +39,13 @@ _PACKAGES = (
     ("pillow", "import PIL"),
     ("trimesh", "import trimesh"),
     ("av", "import av"),
+    ("pyproj", "import pyproj"),
     ("open3d", "import open3d\nif open3d.core.cuda.is_available(): print('CUDA')"),
 )
 
-# They may be broken and a reconstruction still works: av is for video only, open3d for meshes, torch for networks.
-_NOT_NEEDED = frozenset({"av", "open3d", "torch"})
+# They may be broken and a reconstruction still works: av is for video only, open3d for meshes, torch for networks,
+# pyproj to georeference.
+_NOT_NEEDED = frozenset({"av", "open3d", "pyproj", "torch"})
 
 _PARTS = (
     ("importer", "image folder", "smust3r_colmap.importers.image_folder"),
@@ -56,6 +58,7 @@ _PARTS = (
     ("exporter", "PLY cloud", "smust3r_colmap.exporters.ply"),
     ("exporter", "GLB scene", "smust3r_colmap.exporters.glb"),
     ("exporter", "TUM trajectory", "smust3r_colmap.exporters.tum_trajectory"),
+    ("exporter", "georeference", "smust3r_colmap.exporters.geo_files"),
 )
 
 # What a child process runs to import a backbone, and what it runs besides where more is worth knowing.

@@ -63,6 +63,12 @@ class Crs:
         return self.ellipsoidal or self.vertical is not None
 
     @property
+    def title(self) -> str:
+        """The short name, and the long one where there is one."""
+        long = str(self.horizontal.name)
+        return self.name if long in ("unknown", self.name) else f"{self.name} ({long})"
+
+    @property
     def in_degrees(self) -> bool:
         """Longitude and latitude."""
         return bool(self.horizontal.is_geographic)
@@ -244,4 +250,5 @@ def why_outside(x: float, y: float, crs: Crs) -> str:
     degrees = not crs.in_degrees and abs(x) <= 180 and abs(y) <= 90
     hint = "; x and y are swapped: east comes first" if swapped else ""
     hint = "; these are degrees, and the CRS is a projection" if degrees else hint
-    return f"({x:.10g}, {y:.10g}) lies outside of {crs.name} ({crs.horizontal.name}, from {crs.origin}){hint}"
+    hint = "; these are metres, and the CRS is in degrees" if crs.in_degrees and max(abs(x), abs(y)) > 360 else hint
+    return f"({x:.10g}, {y:.10g}) lies outside of {crs.title}, from {crs.origin}{hint}"

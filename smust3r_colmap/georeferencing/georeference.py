@@ -66,6 +66,12 @@ _SMALL_PART = 0.6
 _ENOUGH_TAGS = 8
 """By chance so many tags lie within that part of both with probability 0.0003."""
 
+MANY_PIXELS = 10.0
+"""On the ground, of the horizontal error of surveyed points, which is below one where points and model are sound. (0.25
+on the rendered survey; 120 on copr_gcp, whose points are of a hand-held receiver.)"""
+_FAULTS_SHOWN = 2
+"""Of the records that could not be used, where nothing came out; the last are about all tags together."""
+
 Basis = Literal["control points", "positions of images", "control points and positions of images"]
 
 
@@ -237,7 +243,13 @@ def georeference(
     gps = _gps(model, survey, frame, up, rng)
     local_points = frame.local_from_crs(survey.points_xyz)
     control, rows_of = _control(survey.points, tagged, local_points)
-    solved = _decide(control, gps, up)
+    try:
+        solved = _decide(control, gps, up)
+    except DegenerateAlignmentError as error:
+        said = f"; besides: {'; '.join(faults[-_FAULTS_SHOWN:])}" if faults else ""
+        raise DegenerateAlignmentError(f"{error}{said}") from error
+    scale = float(solved.fit.local_from_model.scale)
+    pixel_size_m = None if model.pixel_size_model is None else model.pixel_size_model * scale
     fixes = _fix_results(model, survey, frame, gps, solved)
     results = _point_results(survey, tagged, local_points, solved, rows_of)
     return Georeference(
@@ -252,10 +264,8 @@ def georeference(
         fixes=fixes,
         points=results,
         faults=tuple(faults),
-        warnings=tuple(_warnings(fixes, results, solved, gps, tagged)),
-        pixel_size_m=None
-        if model.pixel_size_model is None
-        else model.pixel_size_model * float(solved.fit.local_from_model.scale),
+        warnings=(*_warnings(fixes, results, solved, gps, tagged), *_doubts(results, solved, pixel_size_m)),
+        pixel_size_m=pixel_size_m,
     )
 
 
@@ -309,7 +319,7 @@ class _Survey:
             for source, xyz in ((own_points, points_xyz), (own_positions, fixes_xyz))
             if source is not None and len(xyz)
         ]
-        target = target_crs(crs, sources) if sources else None
+        target = target_crs(crs, sources, faults) if sources else None
         if target is not None:
             points_xyz = transform(points_xyz, own_points, target) if own_points else points_xyz
             fixes_xyz = transform(fixes_xyz, own_positions, target) if own_positions else fixes_xyz
@@ -709,3 +719,20 @@ def _warnings(
     if gps.failure is not None and len(gps.images) > 1 and solved.basis == "control points":
         told.append(f"the positions of images are not compared: {gps.failure}")
     return told
+
+
+def _doubts(points: Sequence[PointResult], solved: _Solved, pixel_size_m: float | None) -> list[str]:
+    """What the residuals of surveyed points say of the whole."""
+    if solved.control is None:
+        return []
+    check = [one.residual_m for one in points if one.role == "check" and one.left_out is None]
+    outside = [one.leave_one_out_m for one in points if one.left_out is None]
+    what, measured = ("check points", Accuracy.of(np.array(check))) if check else ("", None)
+    if measured is None:
+        what, measured = "control points, each left out of the fit,", Accuracy.of(np.array(outside))
+    if measured is None:
+        return [f"nothing checks the {MIN_CONTROL} control points: no other point is left to compare"]
+    if pixel_size_m is not None and measured.horizontal > MANY_PIXELS * pixel_size_m:
+        off = f"{measured.horizontal:.3g} m, {measured.horizontal / pixel_size_m:.0f} pixels on the ground"
+        return [f"{what} are {off} off: the points are not exact, or the model is bent"]
+    return []

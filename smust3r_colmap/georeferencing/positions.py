@@ -95,7 +95,8 @@ def fit_positions(
         shifted=np.zeros(len(model), np.bool_),
     )
     if len(rows) < 2:
-        raise DegenerateAlignmentError(f"{len(rows)} position of an image is known; at least 2 are needed, better 5")
+        known = f"{len(rows)} position{'s' if len(rows) != 1 else ''} of images"
+        raise DegenerateAlignmentError(f"{known} can be used; at least 2 are needed, better 5")
     usable = rows if rows.complete.sum() >= 2 else _with_level_heights(rows, up)
     start = consensus(usable, rng, up_model=None if up is None else up.up_model)
     tilt = _contradiction_deg(rows, start, up)

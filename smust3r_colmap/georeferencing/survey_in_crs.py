@@ -98,12 +98,13 @@ def is_local(text: str) -> bool:
     return text.strip().casefold() == LOCAL
 
 
-def target_crs(wanted: str, sources: Sequence[tuple[Crs, FloatArray]]) -> Crs:
+def target_crs(wanted: str, sources: Sequence[tuple[Crs, FloatArray]], faults: list[str]) -> Crs:
     """The projection in metres of the result, with the vertical datum of the first source that has one.
 
     Args:
         wanted: a CRS, or auto: that of the first source, or the zone of UTM where that is in degrees.
         sources: CRS and coordinates (N, 3), control points before positions.
+        faults: gets a message where heights of unknown datum are taken as those of the result.
 
     Raises:
         InputError: the CRS is none, is in degrees, or is not made for the place.
@@ -120,8 +121,12 @@ def target_crs(wanted: str, sources: Sequence[tuple[Crs, FloatArray]]) -> Crs:
     if not is_in_area(transform(xyz, _flat(first), _flat(crs)), crs).any():
         lon, lat = np.median(lon_lat(xyz, first), axis=0)
         raise InputError(
-            f"{crs.origin}: {crs.name} ({crs.horizontal.name}) is not made for the place, longitude {lon:.4f}, "
+            f"{crs.origin}: {crs.title} is not made for the place, longitude {lon:.4f}, "
             f"latitude {lat:.4f} (by {first.name}, {first.origin})"
+        )
+    if crs.has_vertical and not first.has_vertical and np.isfinite(xyz[:, 2]).any():
+        faults.append(
+            f"{first.origin}: it is not said what the heights refer to; they are taken as {crs.vertical_name}, of --crs"
         )
     known = next((source for source, _ in sources if source.has_vertical), None)
     return crs.with_vertical_of(known) if known is not None and not crs.has_vertical else crs

@@ -23,7 +23,7 @@ _POINT_HEAD = ("point", "role", "x", "y", "z", "tags", "worst px", "")
 def render_georeference(found: Georeference) -> str:
     """Lines without the last line end; residuals are surveyed less computed, in metres."""
     crs = found.frame.crs
-    where = "in the coordinates of the site" if crs is None else f"{crs.name} ({crs.horizontal.name})"
+    where = "in the coordinates of the site" if crs is None else crs.title
     heights = "as given" if crs is None else crs.vertical_name
     x, y, z = (f"{value:.0f}" for value in found.frame.offset_m)
     lines = [

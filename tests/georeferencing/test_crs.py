@@ -150,7 +150,8 @@ def test_east_comes_first_whatever_the_axis_order() -> None:
     [
         (5300000, 600000, "EPSG:25832", "x and y are swapped: east comes first"),
         (9.5, 48.0, "EPSG:25832", "these are degrees, and the CRS is a projection"),
-        (600000, 9_900_000, "EPSG:25832", "lies outside of EPSG:25832 (ETRS89 / UTM zone 32N, from here)"),
+        (600000, 9_900_000, "EPSG:25832", "lies outside of EPSG:25832 (ETRS89 / UTM zone 32N), from here"),
+        (600000, 5300000, "EPSG:4326", "these are metres, and the CRS is in degrees"),
         (11.0, 95.0, "EPSG:4326", "x and y are swapped"),
     ],
 )

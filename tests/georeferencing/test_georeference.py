@@ -103,6 +103,27 @@ def test_the_result_is_in_the_crs_that_is_asked_for() -> None:
     )
 
 
+def test_three_control_points_are_checked_by_nothing() -> None:
+    found = find(SURVEY, None, SURVEY.points(np.random.default_rng(21), 3, tag_px=0.0))
+    assert np.abs(camera_errors(SURVEY, found)).max() < 1e-3
+    assert found.warnings == ("nothing checks the 3 control points: no other point is left to compare",)
+
+
+@pytest.mark.slow
+def test_points_that_are_off_by_many_pixels_are_doubted() -> None:
+    rng = np.random.default_rng(22)
+    found = find(SURVEY, None, SURVEY.points(rng, 9, sigma_m=0.8))
+    off = found.accuracies()["control_leave_one_out"].horizontal
+    assert off > 0.5
+    assert found.pixel_size_m is not None
+    assert found.warnings[-1] == (
+        f"control points, each left out of the fit, are {off:.3g} m, {off / found.pixel_size_m:.0f} pixels on the "
+        "ground off: the points are not exact, or the model is bent"
+    )
+    with_check = find(SURVEY, None, SURVEY.points(rng, 9, sigma_m=0.8, roles=["check"] * 3))
+    assert with_check.warnings[-1].startswith("check points are ")
+
+
 @pytest.mark.slow
 def test_check_points_change_nothing() -> None:
     rng = np.random.default_rng(3)
@@ -234,6 +255,8 @@ def test_tags_of_resized_images_are_noticed() -> None:
     assert any(small in text for text in find(SURVEY, positions, scaled(0.5)).faults)
     assert any("made in images of another size" in text for text in find(SURVEY, positions, scaled(4.0)).faults)
     assert not any("size" in text for text in find(SURVEY, positions, points).faults)
+    with pytest.raises(DegenerateAlignmentError, match=r"; besides: .* made in images of another size"):
+        find(SURVEY, None, scaled(40.0))
 
 
 def test_names_are_found_without_folders_and_in_any_case() -> None:
@@ -323,6 +346,11 @@ def test_vertical_datums_are_named_and_never_invented() -> None:
     named = find(SURVEY, None, replace(points, crs="EPSG:25832+7837"))
     assert named.frame.crs is not None
     assert named.frame.crs.vertical_name == "DHHN2016 height"
+    assert named.faults == ()
+    assumed = find(SURVEY, None, points, crs="EPSG:25832+7837")
+    assert assumed.faults == (
+        "gcp_list.txt:1: it is not said what the heights refer to; they are taken as DHHN2016 height, of --crs",
+    )
     positions = degrees(SURVEY, rng)
     gps = find(SURVEY, positions, None, altitude="ellipsoid")
     assert gps.frame.crs is not None

@@ -193,7 +193,7 @@ def test_a_receiver_that_stands_still_is_named() -> None:
 
 def test_one_position_is_too_few() -> None:
     survey = make_survey(np.random.default_rng(0))
-    with pytest.raises(DegenerateAlignmentError, match="1 position of an image is known; at least 2 are needed"):
+    with pytest.raises(DegenerateAlignmentError, match="1 position of images can be used; at least 2 are needed"):
         fit_positions(
             survey.model().centres_model[:1],
             survey.centres_local[:1],
