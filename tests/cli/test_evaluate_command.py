@@ -143,6 +143,7 @@ def test_clouds_are_compared(pair: list[str], tmp_path: Path) -> None:
     assert rows["cloud_within_0.04_units"] == {"accuracy": 100, "completeness": 100, "f_score": 100}
 
 
+@pytest.mark.slow
 def test_depth_maps_of_a_workspace_are_compared_with_the_sensor(tmp_path: Path) -> None:
     """One of three maps is a tenth too deep; the model's unit is a quarter of a metre."""
     data = write_data(tmp_path / "data")

@@ -107,6 +107,7 @@ def test_relative_errors(walks: tuple[Path, Path], delta: float, unit: str, all_
         assert_same(evaluation, metric, error.get_all_statistics())
 
 
+@pytest.mark.slow
 def test_the_scale_is_that_of_evos_alignment(walks: tuple[Path, Path]) -> None:
     estimate, truth = (file_interface.read_tum_trajectory_file(path) for path in walks)
     truth, estimate = sync.associate_trajectories(truth, estimate, max_diff=0.01)
