@@ -22,6 +22,8 @@ DEFAULT_SIGMA_H_M, DEFAULT_SIGMA_V_M = 0.02, 0.03
 FALSE_ALARMS = 0.05
 """Probability that a set of right points has one that is left out, with Gaussian errors of a size not known before.
 (Chosen on copr_gcp, whose wrong point has 0.04: nine points of a hand-held receiver prove no more.)"""
+MAX_OPEN_DEG = 30.0
+"""Of a turn; points that leave more open, as those on a line do, cannot say whether one beside them is wrong."""
 MIN_CONTROL = 3
 """Points with three coordinates that a fit to control points needs."""
 _MOST_FOR_PAIRS = 12
@@ -143,6 +145,8 @@ class _Left:
         if used.complete.sum() < MIN_CONTROL:
             return cls(residuals=np.full((len(subset), 3), np.nan), probability=1.0)
         fitted, factor_h, factor_v = scaled_fit(used, start)
+        if not fitted.tilt_sigma_deg < MAX_OPEN_DEG:
+            return cls(residuals=np.full((len(subset), 3), np.nan), probability=1.0)
         residuals = np.where(np.isfinite(own.sigma), fitted.residuals(own), np.nan)
         covariances = fitted.covariance_of(own.model) + np.einsum(
             "ni,ij->nij", own.scaled(factor_h, factor_v).sigma ** 2, np.eye(3)

@@ -115,6 +115,17 @@ def test_points_on_a_line_leave_the_turn_open() -> None:
     assert abs(fit_control(rows(local)).fit.weakest_axis[0]) == pytest.approx(1, abs=1e-6)
 
 
+def test_the_one_point_beside_a_line_is_not_taken_for_wrong() -> None:
+    """Without it the turn about the line is open, so the others cannot say where it belongs."""
+    rng = np.random.default_rng(8)
+    on_line = np.column_stack([np.linspace(-40, 40, 6), np.zeros(6), np.zeros(6)])
+    exact = rows(np.vstack([on_line, [[0, 25, 1]]]))
+    found = fit_control(with_errors(exact, rng.normal(size=(7, 3)) * 0.02))
+    assert found.left_out == {}
+    assert np.isnan(found.leave_one_out[6]).all()
+    assert found.fit.tilt_sigma_deg < 1
+
+
 def test_two_points_are_too_few() -> None:
     with pytest.raises(DegenerateAlignmentError, match="2 control points with three coordinates are in the model; at"):
         fit_control(rows(field(np.random.default_rng(7), 2)))
