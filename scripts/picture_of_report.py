@@ -16,8 +16,6 @@ from pathlib import Path
 from PIL import Image
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-COLOURS = 96
-"""Of the picture's palette: few enough for a file below 200 kB."""
 QUIET = ("--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-gpu")
 
 
@@ -44,9 +42,7 @@ def main(words: Sequence[str] | None = None) -> int:
         subprocess.run([*command, options.report.resolve().as_uri()], check=True, capture_output=True)
         with Image.open(shot) as opened:
             part = opened.convert("RGB").crop((0, options.top, options.width, options.top + options.height))
-    part.quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
-        options.picture, optimize=True
-    )
+    part.save(options.picture, optimize=True)
     return 0
 
 

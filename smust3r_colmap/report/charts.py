@@ -23,8 +23,6 @@ MAX_DOTS = 1500
 """Images of a path that are drawn as dots with their names; of more, the line alone is drawn."""
 MAX_STRIP = 1200
 """Cells of the strip of images; of more images several share one, which has the worst state."""
-SURROUNDINGS = 0.25
-"""How far beside the path its surroundings are shown, in lengths of the path's drawing."""
 RESIDUAL_ARROW_CELLS = 0.9
 """Length of the longest arrow of a residual grid, in cells."""
 
@@ -165,14 +163,10 @@ def strip(states: Sequence[int], names: Sequence[str], labels: Sequence[str]) ->
 
 
 # ------------------------------------------------------------------------------- path
-def frame_of(paths: Sequence[Path2D], points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Two corners (2,) around all paths, and around most of the points (P, 2) that are near; with a margin."""
+def frame_of(paths: Sequence[Path2D]) -> tuple[FloatArray, FloatArray]:
+    """Two corners (2,) around all paths, with a margin."""
     everything = np.concatenate([path.xy for path in paths])
     low, high = everything.min(axis=0), everything.max(axis=0)
-    if len(points):
-        reach = SURROUNDINGS * float((high - low).max())
-        low = np.maximum(np.minimum(low, np.quantile(points, 0.02, axis=0)), low - reach)
-        high = np.minimum(np.maximum(high, np.quantile(points, 0.98, axis=0)), high + reach)
     margin = 0.08 * max(float((high - low).max()), 1e-9)
     low, high = low - margin, high + margin
     missing = np.maximum(0.35 * (high - low).max() - (high - low), 0) / 2  # a straight path would be a thin line
@@ -230,10 +224,10 @@ def plan(
             for row, colour, (x, y) in zip(path.rows, colours, at.tolist(), strict=True)
         ]
     if is_sequence and len(at):
-        for text, (x, y) in (("first", at[0].tolist()), ("last", at[-1].tolist())):
+        for text, (x, y), lower in (("first", at[0].tolist(), -4), ("last", at[-1].tolist(), 12)):  # apart at a loop
             is_right = x > WIDTH - 40
             anchor = "end" if is_right else "start"
-            drawn.append(_text(x + (-4 if is_right else 4), y - 4, text, anchor=anchor, class_="t halo"))
+            drawn.append(_text(x + (-4 if is_right else 4), y + lower, text, anchor=anchor, class_="t halo"))
     return _svg(height, *drawn, label=path.title)
 
 

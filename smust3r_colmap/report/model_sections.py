@@ -58,7 +58,7 @@ def link_to(image: ImageFacts) -> Markup:
 def plan(model: ModelFacts, summary: Mapping[str, Any]) -> Markup:
     """The path from above: before loops, before bundle adjustment, in the end."""
     is_sequence = model.agreement is None or model.agreement.is_sequence
-    corners = charts.frame_of(model.paths, model.observed.xyz @ model.axes.T)
+    corners = charts.frame_of(model.paths)
     row_of = {name: row for row, name in enumerate(model.names)}
     loops = [
         (row_of[one["image_a"]], row_of[one["image_b"]], one["accepted"])

@@ -13,7 +13,6 @@ from smust3r_colmap.report.markup import Markup
 from smust3r_colmap.report.plan import Path2D
 
 SQUARE = Path2D(title="result", rows=(0, 1, 2, 3), xy=np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]))
-NOWHERE = np.zeros((0, 2))
 NAMES = ("a.jpg", "<b>.jpg", "c.jpg", "d.jpg")
 
 
@@ -58,36 +57,22 @@ def test_the_path_is_drawn_to_scale_with_y_up() -> None:
 
 
 def test_segments_have_their_colours_and_the_lines_between_them_no_gap() -> None:
-    corners = charts.frame_of([SQUARE], NOWHERE)
+    corners = charts.frame_of([SQUARE])
     first, second = elements(charts.plan(SQUARE, corners, colour_of=(0, 0, 11, 11), names=NAMES), "polyline")
     assert (first.get("class"), second.get("class")) == ("path k0", "path k1")
     assert (len(points_of(first)), len(points_of(second))) == (3, 2)
     assert points_of(first)[-1] == points_of(second)[0]
 
 
-def test_the_surroundings_are_shown_as_far_as_they_are_near() -> None:
-    low, high = charts.frame_of([SQUARE], NOWHERE)
-    assert (low.tolist(), high.tolist()) == ([-0.08, -0.08], [1.08, 1.08])
-    walls = np.array([[-0.1, -9.0], [1.2, 0.5]] * 100)
-    low, high = charts.frame_of([SQUARE], walls)
-    margin = 0.08 * 1.3  # of the longer side, which is 1.3 to the right and 1.25 up
-    assert low == pytest.approx([-0.1 - margin, -0.25 - margin])
-    assert high == pytest.approx([1.2 + margin, 1 + margin])
-
-
 def test_images_without_an_order_are_not_joined() -> None:
-    drawing = charts.plan(
-        SQUARE, charts.frame_of([SQUARE], NOWHERE), colour_of=(0,) * 4, names=NAMES, is_sequence=False
-    )
+    drawing = charts.plan(SQUARE, charts.frame_of([SQUARE]), colour_of=(0,) * 4, names=NAMES, is_sequence=False)
     assert not elements(drawing, "polyline")
     assert len(elements(drawing, "circle")) == 4
 
 
 def test_closed_and_refused_loops_differ_and_those_of_other_images_are_left_out() -> None:
     loops = [(0, 3, True), (1, 3, False), (0, 9, True)]
-    drawing = charts.plan(
-        SQUARE, charts.frame_of([SQUARE], NOWHERE), colour_of=(0,) * 4, names=(*NAMES, *"56789x"), loops=loops
-    )
+    drawing = charts.plan(SQUARE, charts.frame_of([SQUARE]), colour_of=(0,) * 4, names=(*NAMES, *"56789x"), loops=loops)
     assert [line.get("class") for line in elements(drawing, "line")] == ["loop", "loop refused"]
 
 
