@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
+import cv2
 import numpy as np
 from PIL import Image
 
@@ -34,6 +35,12 @@ def test_a_turned_photo_is_upright(tmp_path: Path) -> None:
     assert small.shape == (SIDE_PX, SIDE_PX // 2)
     assert small[5].mean() > 250
     assert small[-5].mean() < 5
+
+
+def test_12_bits_in_a_16_bit_file_are_not_black(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "deep.png"), np.full((64, 64), 4095, np.uint16))
+    found, _ = make_thumbnails([tmp_path / "deep.png"], workers=1)
+    assert np.asarray(Image.open(io.BytesIO(found[tmp_path / "deep.png"]))).min() > 250
 
 
 def test_files_that_cannot_be_read_are_named_and_counted(tmp_path: Path) -> None:
