@@ -81,9 +81,9 @@ class SegmentationConfig:
     order: Order = "auto"
     """Whether images that follow each other in name order show the same place: sequence, or unordered; auto decides by
     their likeness, folder by folder."""
-    keyframes: int | Literal["auto", "all"] = "all"
-    """Images that carry the reconstruction: all of them, so many, or those between which a video moves enough (auto).
-    The others are registered to the finished model."""
+    keyframes: int | Literal["auto", "all"] = "auto"
+    """Images that carry the reconstruction: those between which a dense sequence, such as a video at its full rate,
+    moves enough (auto), all, or so many. The others are registered to the finished model."""
     segment_length: int = 60
     """Images per segment (l); the paper's setting."""
     overlap: int = 20

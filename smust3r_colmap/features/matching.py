@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,6 +35,8 @@ _PAIRS_VERIFIED_AT_ONCE = 500
 """Their matches are in memory."""
 _BYTES_PER_PAIR = 16 << 10
 """A thousand matches, before and after verification."""
+MAX_STATIONARY_SHARE = 0.5
+"""Of the matches of a pair; with more, what COLMAP calls a watermark is one."""
 _WATERMARK = int(pycolmap.TwoViewGeometryConfiguration.WATERMARK)
 
 
@@ -112,6 +114,9 @@ def drop_matches_without_evidence(
 ) -> None:
     """Delete stationary matches in static parts and verify those pairs again; empty what COLMAP calls watermarks.
 
+    COLMAP calls matches a watermark that all move alike, as they do, too, where a camera hardly moves. A watermark does
+    not move at all. So pairs whose matches do are verified again without looking for one.
+
     What was deleted is gone, so a second call finds nothing to do.
 
     Raises:
@@ -119,27 +124,25 @@ def drop_matches_without_evidence(
     """
     wanted = set(pairs)
     with open_database(path) as database:
-        watermarks = _watermarks(database) & wanted
         reader = _PairReader.of(database, wanted)
-        pairs_of_one_size = reader.pairs if regions else []
-        for start in range(0, len(pairs_of_one_size), _PAIRS_VERIFIED_AT_ONCE):
+        for start in range(0, len(reader.pairs) if regions else 0, _PAIRS_VERIFIED_AT_ONCE):
             tasks = [
                 _VerificationTask(pair=pair, matches=matches, used=~static, seed=seed)
-                for pair in pairs_of_one_size[start : start + _PAIRS_VERIFIED_AT_ONCE]
+                for pair in reader.pairs[start : start + _PAIRS_VERIFIED_AT_ONCE]
                 if (static := static_matches(matches := reader.matches(pair), regions)).any()
             ]
-            check_room(path, sum(2 * reader.rows[task.pair].nbytes for task in tasks))
-            for result in executor.map(_verify, tasks):
-                task, value = tasks[result.index], result.value
-                if isinstance(value, TaskFailure):
-                    logger.warning("images %d and %d have no geometry: %s", *task.pair, value.reason)
-                    value = pycolmap.TwoViewGeometry()
-                rows = reader.rows[task.pair]
-                value.inlier_matches = rows[np.asarray(value.inlier_matches, np.int64).reshape(-1, 2)[:, 0]]
-                _replace_matches(database, task.pair, rows[task.used], value)
-                watermarks.discard(task.pair)
-                if value.config == _WATERMARK:
-                    watermarks.add(task.pair)
+            _verify_again(database, path, tasks, reader, executor)
+        watermarks = _watermarks(database) & wanted
+        of_one_size = sorted(watermarks & reader.rows.keys())
+        for start in range(0, len(of_one_size), _PAIRS_VERIFIED_AT_ONCE):
+            tasks = [
+                _VerificationTask(pair=pair, matches=matches, used=used, seed=seed, detect_watermark=False)
+                for pair in of_one_size[start : start + _PAIRS_VERIFIED_AT_ONCE]
+                if not (matches := reader.matches(pair)).stationary().mean() > MAX_STATIONARY_SHARE
+                and (used := ~static_matches(matches, regions)).any()
+            ]
+            _verify_again(database, path, tasks, reader, executor)
+            watermarks -= {task.pair for task in tasks}
         for pair in sorted(watermarks):
             _replace_matches(database, pair, np.empty((0, 2), np.uint32), pycolmap.TwoViewGeometry())
 
@@ -150,10 +153,30 @@ class _VerificationTask:
     matches: PairMatches
     used: BoolArray
     seed: int
+    detect_watermark: bool = True
 
 
 def _verify(task: _VerificationTask) -> pycolmap.TwoViewGeometry:
-    return verified(task.matches, task.used, seed=task.seed)
+    return verified(task.matches, task.used, seed=task.seed, detect_watermark=task.detect_watermark)
+
+
+def _verify_again(
+    database: pycolmap.Database,
+    path: Path,
+    tasks: Sequence[_VerificationTask],
+    reader: _PairReader,
+    executor: Executor,
+) -> None:
+    """Keep the used matches of the pairs and the geometry that they have."""
+    check_room(path, sum(2 * reader.rows[task.pair].nbytes for task in tasks))
+    for result in executor.map(_verify, tasks):
+        task, value = tasks[result.index], result.value
+        if isinstance(value, TaskFailure):
+            logger.warning("images %d and %d have no geometry: %s", *task.pair, value.reason)
+            value = pycolmap.TwoViewGeometry()
+        rows = reader.rows[task.pair]
+        value.inlier_matches = rows[np.asarray(value.inlier_matches, np.int64).reshape(-1, 2)[:, 0]]
+        _replace_matches(database, task.pair, rows[task.used], value)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

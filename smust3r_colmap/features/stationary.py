@@ -184,14 +184,16 @@ def contradicted_matches(pair: PairMatches, *, seed: int) -> BoolArray | None:
 
 
 def verified(
-    pair: PairMatches, used: BoolArray, *, seed: int, max_trials: int | None = None
+    pair: PairMatches, used: BoolArray, *, seed: int, max_trials: int | None = None, detect_watermark: bool = True
 ) -> pycolmap.TwoViewGeometry:
     """COLMAP's two-view geometry of the matches that are ``used``; its inliers are rows of the pair.
 
     Args:
         max_trials: of RANSAC; None takes COLMAP's own number.
+        detect_watermark: whether matches that all move alike can be a watermark.
     """
     options = pycolmap.TwoViewGeometryOptions()
+    options.detect_watermark = detect_watermark
     if max_trials is not None:
         options.ransac.max_num_trials = max_trials
     options.ransac.random_seed = seed

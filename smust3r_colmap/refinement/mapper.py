@@ -244,7 +244,9 @@ class MapperSession:
         """
         self.features = features
         self.verify(FINE_TOLERANCE_FRACTION)
-        found = [i + 1 for i in images if self.mapper.register_next_image(self._registration_options(), i + 1)]
+        found: list[int] = []
+        while new := self._register_each([i + 1 for i in images if i + 1 not in found]):  # some match only these
+            found += new
 
         def step() -> bool:
             return adjust_images(self.model, found, max_iterations=SUBSET_ITERATIONS, threads=self.threads)
@@ -255,6 +257,10 @@ class MapperSession:
         for image_id in contradicted:
             self.mapper.observation_manager.deregister_frame(self.model.image(image_id).frame_id)
         self.registered = tuple(sorted({*self.registered, *(i - 1 for i in found if i not in contradicted)}))
+
+    def _register_each(self, image_ids: Sequence[int]) -> list[int]:
+        options = self._registration_options()
+        return [i for i in image_ids if self.mapper.register_next_image(options, i)]
 
     def _contradicted(self, image_ids: Sequence[int]) -> set[int]:
         """Those of the images whose verified matches do not satisfy the epipolar constraint; see ``agrees``."""

@@ -27,13 +27,14 @@ from smust3r_colmap.features.covisibility import SeenSurface, select_pairs
 from smust3r_colmap.features.guided_verification import read_matched_features
 from smust3r_colmap.features.pose_readings import AS_COLMAP, agreement, best_reading
 from smust3r_colmap.features.seen_surfaces import seen_surfaces, surfaces_of_clouds, surfaces_of_maps
-from smust3r_colmap.features.stage import features_of_run, match_pairs_of_run
+from smust3r_colmap.features.stage import features_of_run, match_pairs_of_run, verified_pairs
 from smust3r_colmap.geometry.arrays import FloatArray, Pair
 from smust3r_colmap.products import EMPTY_CLOUD, DepthMaps, ImageCollection, RunFeatures, Scene
 from smust3r_colmap.refinement.global_refinement import RESULTS, UNCERTAINTIES, RefineTask, refine_scenes
 from smust3r_colmap.refinement.mapper import COARSE_TOLERANCE_FRACTION
 from smust3r_colmap.refinement.model_uncertainty import ModelUncertainty, UncertaintySummary, summarise_uncertainty
 from smust3r_colmap.refinement.statistics import SceneRefinement
+from smust3r_colmap.segmentation.keyframes import pairs_with_neighbours
 from smust3r_colmap.segmentation.stage import Segments
 from smust3r_colmap.segmentation.view_graph import ViewGraph
 from smust3r_colmap.segmentation.windows import plan_windows
@@ -303,7 +304,13 @@ def _match(
         pair_ids, _ = database.read_all_matches()
     known = {(a - 1, b - 1) for a, b in map(pycolmap.pair_id_to_image_pair, pair_ids)}
     wanted = {*_wanted_pairs(run, initial, seen, features, known, per_image), *initial.pairs_of_others}
-    return tuple(sorted(known | match_pairs_of_run(run, features, sorted(wanted), title="track matching")))
+    matched = match_pairs_of_run(run, features, sorted(wanted), title="track matching")
+    verified = verified_pairs(run, features, initial.pairs_of_others, title="track matching") if initial.others else {}
+    blurred = set(initial.others) - {image for pair in verified for image in pair}
+    if blurred:
+        near = pairs_with_neighbours(len(features.usable), blurred)
+        matched |= match_pairs_of_run(run, features, near, title="track matching of blurred images")
+    return tuple(sorted(known | matched))
 
 
 def _wanted_pairs(

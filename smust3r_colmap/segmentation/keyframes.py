@@ -8,7 +8,7 @@ to the refined model. The next module to read is ``order``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from typing import Literal
 
@@ -23,6 +23,8 @@ MAX_SHARE = 0.5
 """Of the images that keyframes may be; with more, leaving the others out saves little and all are used."""
 _TESTED_PAIRS = 20
 """Pairs of neighbours, evenly spread, that tell whether a collection can be dense at all."""
+
+_NEAR_IMAGES = 2
 
 
 def choose_keyframes(
@@ -58,6 +60,16 @@ def pairs_with_keyframes(num_images: int, others: Sequence[int]) -> tuple[Pair, 
     after = np.clip(np.searchsorted(keyframes, others), 1, len(keyframes) - 1)
     beside = [(int(keyframes[k]), int(i)) for k, i in zip([*(after - 1), *after], [*others, *others], strict=True)]
     return tuple(sorted((min(pair), max(pair)) for pair in beside))
+
+
+def pairs_with_neighbours(num_images: int, images: Iterable[int]) -> tuple[Pair, ...]:
+    """Pairs (i < j) of each of the images with the ``_NEAR_IMAGES`` before and after it, ascending.
+
+    Blurred images match each other, but no keyframe farther away.
+    """
+    steps = [step for step in range(-_NEAR_IMAGES, _NEAR_IMAGES + 1) if step]
+    beside = [(image, image + step) for image in images for step in steps if 0 <= image + step < num_images]
+    return tuple(sorted({(min(pair), max(pair)) for pair in beside}))
 
 
 def _may_be_dense(images: Sequence[SourceImage]) -> bool:

@@ -154,9 +154,15 @@ def test_the_database_keeps_only_evidence(drive: World, tmp_path: Path) -> None:
         assert np.rad2deg(np.arccos(np.clip((off - 1) / 2, -1, 1))) < 1.0
 
 
-def test_pairs_that_colmap_calls_watermarks_are_emptied(drive: World, tmp_path: Path) -> None:
+@pytest.mark.parametrize("moves", [False, True])
+def test_a_pair_that_colmap_calls_a_watermark_is_emptied_if_it_does_not_move(
+    drive: World, tmp_path: Path, moves: bool
+) -> None:
     path = tmp_path / "database.db"
-    matches = {(0, 1): true_matches(drive, (0, 1)), (0, 2): true_matches(drive, (0, 2))}
+    bonnet = len(drive.points)
+    matches = {pair: true_matches(drive, pair) for pair in ((0, 1), (0, 2))}
+    on_bonnet = drive.point_of[0][matches[0, 1][:, 0]] >= bonnet
+    matches[0, 1] = matches[0, 1][~on_bonnet if moves else on_bonnet]
     write_features(path, make_collection(tmp_path, NUM_IMAGES), drive, verified=matches)
     watermark = int(pycolmap.TwoViewGeometryConfiguration.WATERMARK)
     with pycolmap.Database.open(path) as database:
@@ -166,9 +172,10 @@ def test_pairs_that_colmap_calls_watermarks_are_emptied(drive: World, tmp_path: 
     with TaskPool(workers=1) as pool:
         drop_matches_without_evidence(path, matches, NO_REGIONS, executor=pool, seed=0)
     found = read_matched_features(path, range(NUM_IMAGES))
-    assert list(found.raw) == list(found.verified) == [(0, 2)]
+    assert list(found.raw) == list(found.verified) == ([(0, 1), (0, 2)] if moves else [(0, 2)])
     with pycolmap.Database.open(path) as database:
-        assert database.exists_matches(1, 2), "matched, with nothing found; it is not tried again"
+        assert database.exists_matches(1, 2), "matched; it is not tried again"
+        assert database.read_two_view_geometry(1, 2).config != watermark
 
 
 def test_static_matches_are_those_that_do_not_move() -> None:

@@ -130,17 +130,20 @@ def refined(
 
 
 OTHERS, CONTRADICTED, NUM_WRONG = (3, 4, 8, 11), 8, 150
+BLURRED, SHARP = 3, 4
 
 
 @pytest.fixture(scope="module")
 def between_keyframes(tmp_path_factory: pytest.TempPathFactory) -> tuple[Refined, Refined]:
-    """Keyframes alone, and with the images between them, one of which matches more of what it does not see."""
+    """Keyframes alone, and with those between them: one matches more of what it does not see, one no keyframe."""
     rng = np.random.default_rng(5)
     world = make_world(arc(NUM_IMAGES), ball(220, rng), rng)
     stitched = disturbed(world.cam_from_world, rng, position=0.006 * world.extent, rotation_deg=0.4)
     keyframes = [i for i in range(NUM_IMAGES) if i not in OTHERS]
     matches = {pair: true_matches(world, pair) for pair in pairs_within(keyframes, REACH)}
     of_others = {pair: true_matches(world, pair) for pair in pairs_with_keyframes(NUM_IMAGES, OTHERS)}
+    of_others = {pair: rows for pair, rows in of_others.items() if BLURRED not in pair}
+    of_others[BLURRED, SHARP] = true_matches(world, (BLURRED, SHARP))
     after = (CONTRADICTED, CONTRADICTED + 1)
     of_others[CONTRADICTED - 1, CONTRADICTED] = of_others[CONTRADICTED - 1, CONTRADICTED][: NUM_WRONG // 2]
     of_others[after] = wrong_matches(world, after, NUM_WRONG, rng)

@@ -11,7 +11,7 @@ import pytest
 from smust3r_colmap.config import CameraConfig
 from smust3r_colmap.importers.image_folder import import_image_folder
 from smust3r_colmap.products import SourceImage
-from smust3r_colmap.segmentation.keyframes import choose_keyframes, pairs_with_keyframes
+from smust3r_colmap.segmentation.keyframes import choose_keyframes, pairs_with_keyframes, pairs_with_neighbours
 
 WIDTH, HEIGHT = 320, 240
 
@@ -73,3 +73,8 @@ def test_every_other_image_has_two_pairs(others: tuple[int, ...]) -> None:
         assert len(partners) == 2
         assert not set(partners) & set(others)
     assert all(i < j for i, j in pairs)
+
+
+def test_neighbours_are_two_before_and_two_after() -> None:
+    assert pairs_with_neighbours(9, [0, 5]) == ((0, 1), (0, 2), (3, 5), (4, 5), (5, 6), (5, 7))
+    assert pairs_with_neighbours(4, [2, 3]) == ((0, 2), (1, 2), (1, 3), (2, 3))
