@@ -42,6 +42,7 @@ from smust3r_colmap.products import DepthMaps, ImageCollection, Scene
 from smust3r_colmap.refinement.acceptance import MAX_ERROR_PX
 from smust3r_colmap.refinement.bundle_adjustment import Tolerance
 from smust3r_colmap.refinement.contradictions import point_support
+from smust3r_colmap.refinement.focal_lengths import contradicted_focal_lengths
 from smust3r_colmap.refinement.mapper import (
     COARSE_TOLERANCE_FRACTION,
     FINE_TOLERANCE_FRACTION,
@@ -218,6 +219,8 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
 
     _adjust_until_converged(session, fine)
     warnings = _warnings(session, reregistered, may_zoom=_may_zoom(task))
+    if task.features is not None and not task.calibrated:
+        warnings += contradicted_focal_lengths(session.model, task.features, task.collection)
     session.reset_weak_images()
     if task.others:
         session.register_between(features, task.others, _final_max_error_px(fine))

@@ -26,10 +26,10 @@ from smust3r_colmap.refinement.reregistration import pair_support
 
 NEAR = 5
 """Images that are at most so far apart in a sequence are neighbours: what contradicts there is not a look-alike."""
-SEQUENCE_FRACTION, LONG_STEPS = 0.5, 0.6
+SEQUENCE_FRACTION, LONG_STEPS, SHORT_STEPS = 0.5, 0.6, 0.1
 """The order of the names is the order of a path if that part of the consecutive images has verified matches, unless
-steps between them are so long beside the distance of any two images. Of fewer than ``MIN_ORDERED`` images every step
-is long."""
+steps between them are so long beside the distance of any two images; and if they are so short, as between the frames of
+a video, of which many match keyframes only. Of fewer than ``MIN_ORDERED`` images the steps tell nothing."""
 MIN_ORDERED = 8
 MIN_GROUP = 3
 """Images of a group that is shown."""
@@ -62,7 +62,7 @@ class Agreement:
     Args:
         support: by pair of rows (i < j), of pairs with at least eight verified matches.
         groups: of at least ``MIN_GROUP`` images, largest first.
-        is_sequence: consecutive images match and are near, so far apart in order is far apart on the path.
+        is_sequence: consecutive images are near, so far apart in order is far apart on the path.
     """
 
     num_images: int
@@ -75,12 +75,13 @@ class Agreement:
         """Group the images, whose centres are (N, 3)."""
         num_images = len(centres)
         found = [rows for rows in consistent_groups(support, range(num_images)) if len(rows) >= MIN_GROUP]
-        consecutive = sum(j - i == 1 for i, j in support)
+        matched = sum(j - i == 1 for i, j in support) >= SEQUENCE_FRACTION * max(num_images - 1, 1)
+        step = _median_step(centres)
         return cls(
             num_images=num_images,
             support=support,
             groups=tuple(_group(rows, found[:k], support) for k, rows in enumerate(found)),
-            is_sequence=consecutive >= SEQUENCE_FRACTION * max(num_images - 1, 1) and not _steps_are_long(centres),
+            is_sequence=matched if step is None else step < SHORT_STEPS or (matched and step <= LONG_STEPS),
         )
 
     @property
@@ -140,13 +141,14 @@ class Agreement:
         return fractions
 
 
-def _steps_are_long(centres: FloatArray) -> bool:
+def _median_step(centres: FloatArray) -> float | None:
+    """Between consecutive images, beside the distance of any two; None where it tells nothing."""
     if len(centres) < MIN_ORDERED:
-        return False
+        return None
     steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     others = np.random.default_rng(0).permutation(len(centres))
-    between = np.linalg.norm(centres - centres[others], axis=1)[others != np.arange(len(centres))]
-    return bool(np.median(steps) > LONG_STEPS * np.median(between))
+    between = float(np.median(np.linalg.norm(centres - centres[others], axis=1)[others != np.arange(len(centres))]))
+    return float(np.median(steps)) / between if between > 0 else None
 
 
 def _group(rows: Sequence[int], larger: Sequence[Sequence[int]], support: Mapping[Pair, EpipolarSupport]) -> Group:

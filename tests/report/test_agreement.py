@@ -150,6 +150,12 @@ def test_where_all_pairs_match_the_steps_tell_whether_there_is_an_order() -> Non
     assert Agreement.of({(0, 1): GOOD, (1, 2): GOOD}, line(3)).is_sequence
 
 
+def test_frames_between_keyframes_are_a_sequence_though_they_match_keyframes_only() -> None:
+    support = {(k - k % 10, k): GOOD for k in range(200) if k % 10}
+    assert Agreement.of(support, line(200)).is_sequence
+    assert not Agreement.of(support, line(200)[np.random.default_rng(1).permutation(200)]).is_sequence
+
+
 def test_of_many_images_a_cell_has_the_fraction_of_all_its_matches() -> None:
     support = {(i, i + 1): GOOD for i in range(2 * MAX_CELLS - 1)}
     support[0, 2] = EpipolarSupport(num_matches=300, inlier_fraction=0.0)
