@@ -49,7 +49,7 @@ from smust3r_colmap.storage.run_directory import (
 
 NEXT_IMAGES = 4
 """Neighbours in order that are always matched if the backbone has matched nothing."""
-METHOD_VERSION = 8
+METHOD_VERSION = 9
 """To be raised when the refinement changes, so that finished folders are refined again."""
 WORKERS_PER_THREAD = 2
 """Adjustment gains little from threads: on two cores a second one took 70 % more processor time and saved no time."""
