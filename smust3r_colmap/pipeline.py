@@ -65,7 +65,7 @@ def reconstruct(
     with Run.open(output, workers=num_workers(config.workers), seed=config.seed, reporter=reporter) as run:
         source = importers.take_frames(run, images, config, overwrite=overwrite)
         scan, collection = importers.read_images(run, source, config, overwrite=overwrite)
-        collection = segmentation.with_keyframes(run, collection, config)
+        collection = segmentation.with_keyframes(run, collection, config, overwrite=overwrite)
         backbone = backbones.make(run, factory, collection, config)
         begin_stages(run, scan, overwrite=overwrite)
         segments = segmentation.plan(run, collection, backbone.describe, config)

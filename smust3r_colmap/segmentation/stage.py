@@ -94,8 +94,12 @@ class Segments:
         )
 
 
-def with_keyframes(run: Run, collection: ImageCollection, config: RunConfig) -> ImageCollection:
-    """The collection that says which images are keyframes: all of them where nothing would register the others."""
+def with_keyframes(run: Run, collection: ImageCollection, config: RunConfig, *, overwrite: bool) -> ImageCollection:
+    """The collection that says which images are keyframes: all of them where nothing would register the others.
+
+    Args:
+        overwrite: what an earlier run chose is not read; it is deleted once all input was checked.
+    """
     options = config.segmentation
     if not config.refinement.refine:
         return collection
@@ -106,7 +110,11 @@ def with_keyframes(run: Run, collection: ImageCollection, config: RunConfig) -> 
         return chosen
 
     inputs = ([image.digest for image in collection.images], options.keyframes, options.segment_length)
-    keyframes = run.cached("keyframes", inputs, compute, _KEYFRAMES)
+    if overwrite:
+        with run.clock.stage("keyframes", total=1) as progress:
+            keyframes = compute(progress)
+    else:
+        keyframes = run.cached("keyframes", inputs, compute, _KEYFRAMES)
     if len(keyframes) < len(collection):
         run.clock.note(f"{len(keyframes)} of {len(collection)} images are keyframes; the others are registered to them")
     chosen = set(keyframes)

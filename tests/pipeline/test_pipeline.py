@@ -203,7 +203,8 @@ def test_a_changed_setting_redoes_its_stage_and_what_follows(
     denser = replace(BRIEF, classical=replace(BRIEF.classical, dense_size=120))
     again = reused(run(brief_walk, copy, denser))
     assert {name for name, was_reused in again.items() if was_reused} == {
-        "keyframes", "features", "descriptors", "loops", "matching", "mapping", "calibration", "alignment",
+        "keyframes", "features", "descriptors", "loops", "matching", "focal lengths", "mapping", "calibration",
+        "alignment",
     }  # fmt: skip
     fewer_points = replace(denser, fusion=FusionConfig(max_points=5_000))
     again = reused(run(brief_walk, copy, fewer_points))
