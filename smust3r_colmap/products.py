@@ -108,6 +108,11 @@ class ImageCollection:
         return len(self.images)
 
     @property
+    def others(self) -> tuple[int, ...]:
+        """Indices of the images that are no keyframes."""
+        return tuple(k for k, image in enumerate(self.images) if not image.is_keyframe)
+
+    @property
     def mask_digests(self) -> tuple[str, ...]:
         """One per image, an empty one where it has no mask; none at all where no image has one."""
         digests = tuple("" if image.mask is None else image.mask.digest for image in self.images)

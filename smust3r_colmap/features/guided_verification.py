@@ -72,6 +72,15 @@ def read_matched_features(database: Path, images: Collection[int]) -> MatchedFea
     return MatchedFeatures(keypoints=keypoints, raw=raw, verified=verified)
 
 
+def count_verified(database: Path) -> dict[Pair, int]:
+    """Verified matches of the pairs that have ``MIN_VERIFIED``, ascending, by pair of image indices."""
+    with open_database(database) as opened:
+        pair_ids, counts = opened.read_two_view_geometry_num_inliers()
+    pairs = (pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids)
+    counted = {(a - 1, b - 1): int(count) for (a, b), count in zip(pairs, counts, strict=True)}
+    return {pair: counted[pair] for pair in sorted(counted) if counted[pair] >= MIN_VERIFIED}
+
+
 def _keypoints(database: pycolmap.Database, image: int) -> npt.NDArray[np.float32]:
     """(K, 2) positions; for an image without a row in the database pycolmap returns (0, 0)."""
     keypoints = np.asarray(database.read_keypoints(image + 1), dtype=np.float32)

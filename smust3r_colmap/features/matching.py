@@ -138,7 +138,7 @@ def drop_matches_without_evidence(
             tasks = [
                 _VerificationTask(pair=pair, matches=matches, used=used, seed=seed, detect_watermark=False)
                 for pair in of_one_size[start : start + _PAIRS_VERIFIED_AT_ONCE]
-                if not (matches := reader.matches(pair)).stationary().mean() > MAX_STATIONARY_SHARE
+                if (matches := reader.matches(pair)).stationary().mean() <= MAX_STATIONARY_SHARE  # False for none
                 and (used := ~static_matches(matches, regions)).any()
             ]
             _verify_again(database, path, tasks, reader, executor)

@@ -34,6 +34,12 @@ METHOD_VERSION = 2
 """To be raised when the pairs found may change, so that finished folders look again."""
 
 
+def look_alikes(task: VerifiedPairs) -> tuple[Pair, ...]:
+    """The pairs that are ``MAX_ROTATION_ERROR_DEG`` and more from the averaged rotations, ascending."""
+    far = np.flatnonzero(rotation_errors_deg(task) > MAX_ROTATION_ERROR_DEG)
+    return tuple(task.pairs[k] for k in far)
+
+
 def rotation_errors_deg(task: VerifiedPairs) -> npt.NDArray[np.float64]:
     """(E,) angle in degrees between the rotation of each pair and the averaged ones; NaN where there is none.
 

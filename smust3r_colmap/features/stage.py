@@ -5,11 +5,11 @@ The next module to read is ``correspondences``.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
-import pycolmap
 
 from smust3r_colmap.colmap.database import create_database, open_database
 from smust3r_colmap.config import FeatureConfig
@@ -17,23 +17,25 @@ from smust3r_colmap.errors import ReconstructionError
 from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.execution.task_pool import TaskFailure, in_child
-from smust3r_colmap.features.guided_verification import MIN_VERIFIED
+from smust3r_colmap.features.guided_verification import count_verified
 from smust3r_colmap.features.matching import drop_matches_without_evidence, find_static_parts, match_pairs
 from smust3r_colmap.features.pairs import alike_pairs, neighbouring_pairs
-from smust3r_colmap.features.rotation_consistency import (
-    MAX_ROTATION_ERROR_DEG,
-    METHOD_VERSION,
-    rotation_errors_deg,
-)
+from smust3r_colmap.features.rotation_consistency import METHOD_VERSION, look_alikes
 from smust3r_colmap.features.sift import METHOD_BETWEEN_KEYFRAMES, extract_features
 from smust3r_colmap.features.stationary import NO_REGIONS, StaticRegions, describe
-from smust3r_colmap.features.view_graph_calibration import VerifiedPairs, cross_validated_cameras
+from smust3r_colmap.features.view_graph_calibration import (
+    CALIBRATION_VERSION,
+    VerifiedPairs,
+    cross_validated_cameras,
+)
 from smust3r_colmap.features.vlad import FEATURES_PER_IMAGE, vlad_descriptors
 from smust3r_colmap.geometry.arrays import Float32Array, Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import ImageCollection, RunFeatures, Scene
 from smust3r_colmap.storage.codec import Codec
 from smust3r_colmap.storage.run_directory import key_of
+
+T = TypeVar("T")
 
 _STATIC_REGIONS: Codec[StaticRegions] = Codec(StaticRegions, "static_regions")
 """Beside the database of the features."""
@@ -52,8 +54,7 @@ def feature_database_of_run(run: Run, collection: ImageCollection, options: Feat
     images = [(image.digest, image.width, image.height, image.camera) for image in collection.images]
     settings = (options.max_image_size, options.max_features, run.seed)
     masks = (collection.mask_digests,) if collection.mask_digests else ()
-    others = [k for k, image in enumerate(collection.images) if not image.is_keyframe]
-    between = (METHOD_BETWEEN_KEYFRAMES, others) if others else ()
+    between = (METHOD_BETWEEN_KEYFRAMES, collection.others) if collection.others else ()
     stored = run.folder.stage(
         "features", key=key_of("features", images, collection.cameras, *settings, *masks, *between)
     )
@@ -120,14 +121,7 @@ def match_pairs_of_run(
 def verified_pairs(run: Run, features: RunFeatures, pairs: Iterable[Pair], *, title: str) -> dict[Pair, int]:
     """Match and verify pairs; the number of verified matches of those that have ``MIN_VERIFIED``, by ascending pair."""
     matched = match_pairs_of_run(run, features, pairs, title=title)
-    with open_database(features.database) as opened:
-        pair_ids, counts = opened.read_two_view_geometry_num_inliers()
-    found = {}
-    for pair_id, count in zip(pair_ids, counts, strict=True):
-        a, b = pycolmap.pair_id_to_image_pair(pair_id)
-        if count >= MIN_VERIFIED and (a - 1, b - 1) in matched:
-            found[a - 1, b - 1] = count
-    return dict(sorted(found.items()))
+    return {pair: count for pair, count in count_verified(features.database).items() if pair in matched}
 
 
 def cross_validated_cameras_of_run(
@@ -137,60 +131,61 @@ def cross_validated_cameras_of_run(
 
     See ``view_graph_calibration``.
     """
-    verified = _verified(run, features, collection, pairs)
-
-    def compute(progress: Stage) -> tuple[Intrinsics, ...]:
-        cameras = in_child(cross_validated_cameras, verified, log_file=run.folder.native_log)
-        progress.advance()
-        if isinstance(cameras, TaskFailure):
-            raise ReconstructionError(cameras.reason)
-        return cameras
-
+    verified = VerifiedPairs.of(features.database, pairs, collection, seed=run.seed)
+    inputs = (CALIBRATION_VERSION, features.key, verified.pairs, run.seed)
     try:
-        inputs = (features.key, verified.pairs, run.seed)
-        return run.cached("view_graph_calibration", inputs, compute, _CAMERAS, title="focal lengths")
-    except ReconstructionError as error:  # not stored, so that the next start tries again
+        return _cached_from_child(
+            run, "view_graph_calibration", inputs, cross_validated_cameras, verified, _CAMERAS, title="focal lengths"
+        )
+    except ReconstructionError as error:
         run.clock.warn(f"mapping begins with guessed focal lengths: {error}")
         return collection.cameras
-
-
-def _verified(run: Run, features: RunFeatures, collection: ImageCollection, pairs: Iterable[Pair]) -> VerifiedPairs:
-    return VerifiedPairs(
-        database=features.database,
-        pairs=tuple(sorted(pairs)),
-        cameras=collection.cameras,
-        camera_of={k: image.camera for k, image in enumerate(collection.images)},
-        seed=run.seed,
-    )
 
 
 def look_alike_pairs(
     run: Run, features: RunFeatures, collection: ImageCollection, pairs: Iterable[Pair]
 ) -> tuple[Pair, ...]:
     """Verified pairs whose relative rotation the others contradict, ascending; see ``rotation_consistency``."""
-    task = _verified(run, features, collection, pairs)
-    tested = task.pairs
-
-    def compute(progress: Stage) -> tuple[Pair, ...]:
-        errors_deg = in_child(rotation_errors_deg, task, log_file=run.folder.native_log)
-        progress.advance()
-        if isinstance(errors_deg, TaskFailure):
-            raise ReconstructionError(errors_deg.reason)
-        return tuple(tested[k] for k in np.flatnonzero(errors_deg > MAX_ROTATION_ERROR_DEG))
-
+    verified = VerifiedPairs.of(features.database, pairs, collection, seed=run.seed)
+    inputs = (METHOD_VERSION, features.key, verified.pairs, run.seed)
     try:
-        inputs = (METHOD_VERSION, features.key, tested, run.seed)
-        found = run.cached("look_alikes", inputs, compute, _PAIRS, title="look-alikes")
-    except ReconstructionError as error:  # not stored, so that the next start tries again
+        found = _cached_from_child(run, "look_alikes", inputs, look_alikes, verified, _PAIRS, title="look-alikes")
+    except ReconstructionError as error:
         run.clock.warn(f"look-alike places were not looked for: {error}")
         return ()
     if found:
         one, other = (collection.images[k].name for k in found[0])
         run.clock.note(
-            f"{len(found)} of {len(tested)} pairs are left out as look-alikes, such as {one} and {other}: the "
+            f"{len(found)} of {len(verified.pairs)} pairs are left out as look-alikes, such as {one} and {other}: the "
             "rotations of all other pairs contradict theirs"
         )
     return found
+
+
+def _cached_from_child(
+    run: Run,
+    name: str,
+    inputs: object,
+    function: Callable[[VerifiedPairs], T],
+    verified: VerifiedPairs,
+    codec: Codec[T],
+    *,
+    title: str,
+) -> T:
+    """As ``Run.cached``, computed by native code in a child process.
+
+    Raises:
+        ReconstructionError: it failed. Nothing is stored, so that the next start tries again.
+    """
+
+    def compute(progress: Stage) -> T:
+        found = in_child(function, verified, log_file=run.folder.native_log)
+        progress.advance()
+        if isinstance(found, TaskFailure):
+            raise ReconstructionError(found.reason)
+        return found
+
+    return run.cached(name, inputs, compute, codec, title=title)
 
 
 def describe_images(run: Run, features: RunFeatures) -> Float32Array:

@@ -17,6 +17,8 @@ import pycolmap
 from smust3r_colmap.estimators.robust import MAD_TO_SIGMA
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
+from smust3r_colmap.geometry.sim3 import invert_rigid
+from smust3r_colmap.geometry.triangulation import triangulation_angle_deg
 
 MIN_ANGLE_DEG = 1.0
 """Largest angle between the rays of a point below which its depth is not known."""
@@ -81,7 +83,7 @@ def triangulate(views: Sequence[View], left_out: Mapping[int, str] | None = None
     if point is None:
         return None
     point = np.asarray(point, np.float64).reshape(3)
-    if _largest_angle_deg(poses, point) < MIN_ANGLE_DEG:
+    if triangulation_angle_deg(point, invert_rigid(np.stack(poses))[:, :, 3]) < MIN_ANGLE_DEG:
         return None
     return Triangulated(point_model=point, errors_px=reprojection_errors(point, views), left_out=left_out)
 
@@ -93,12 +95,6 @@ def reprojection_errors(point_model: FloatArray, views: Sequence[View]) -> Float
         in_camera = view.cam_from_model[:, :3] @ point_model + view.cam_from_model[:, 3]
         errors.append(float(np.linalg.norm(view.camera.xy_img(in_camera[None])[0] - view.xy)))
     return np.asarray(np.nan_to_num(np.array(errors), nan=np.inf), np.float64)
-
-
-def _largest_angle_deg(poses: Sequence[FloatArray], point: FloatArray) -> float:
-    rays = np.array([-pose[:, :3].T @ pose[:, 3] - point for pose in poses])
-    rays /= np.linalg.norm(rays, axis=1)[:, None]
-    return float(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
 
 
 def tag_limit_px(triangulated: Sequence[Triangulated], longer_side: int) -> float:

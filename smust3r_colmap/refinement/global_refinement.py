@@ -85,7 +85,7 @@ class RefineTask:
     Args:
         stored: the stage that gets ``0/model``, ``1/model`` ..., ``database.db``, ``refinements.json`` and
             ``uncertainties.json``.
-        collection: all images.
+        collection: all images; those that are no keyframes are registered to the model when it is finished.
         scenes: with initial poses; their points are not used.
         features: the run's database of SIFT features and matches, or None.
         maps: depth by image name, to match by pointmaps, or None.
@@ -97,7 +97,6 @@ class RefineTask:
         principal_point: refine the principal points where the model determines them.
         register_missing: let COLMAP's mapper register images without a pose in the end, in the largest model.
         initial_poses_count: see ``measure_uncertainty``.
-        others: images that are no keyframes; they are registered to the model when it is finished.
     """
 
     stored: StageFolder
@@ -113,7 +112,6 @@ class RefineTask:
     principal_point: bool = True
     register_missing: bool = False
     initial_poses_count: bool = False
-    others: tuple[int, ...] = ()
 
 
 def refine_scenes(task: RefineTask) -> tuple[SceneRefinement, ...]:
@@ -193,7 +191,7 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
     fine = Tolerance(pixels=fine_px, angle_deg=FINE_ANGLE_DEG)
     session = MapperSession(
         task.collection,
-        _without(task.others, features),
+        _without(task.collection.others, features),
         tuple(scene.cameras.get(i, prior) for i, prior in enumerate(task.collection.cameras)),
         dict(zip(scene.image_indices, scene.cam_from_world, strict=True)),
         tolerance=task.tolerance,
@@ -222,8 +220,8 @@ def _refine_scene(task: RefineTask, scene: Scene, features: MatchedFeatures, scr
     if task.features is not None and not task.calibrated:
         warnings += contradicted_focal_lengths(session.model, task.features, task.collection)
     session.reset_weak_images()
-    if task.others:
-        session.register_between(features, task.others, _final_max_error_px(fine))
+    if task.collection.others:
+        session.register_between(features, task.collection.others, _final_max_error_px(fine))
         session.reset_weak_images()
     session.end()
     _extract_colors(session.model, task.collection)

@@ -17,7 +17,7 @@ import pycolmap
 
 from smust3r_colmap.colmap.database import write_colmap_database
 from smust3r_colmap.colmap.reconstruction import cameras_of, poses_of
-from smust3r_colmap.features.guided_verification import MatchedFeatures, View, inlier_fractions, verify_guided
+from smust3r_colmap.features.guided_verification import MatchedFeatures, View, verify_guided
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.geometry.sim3 import invert_rigid
@@ -253,7 +253,7 @@ class MapperSession:
 
         self._try("bundle adjustment of the registered images", step)
         self.filter(max_error_px)
-        contradicted = self._contradicted(found)
+        contradicted = contradicted_images(self.features, self.model, found, self.collection)
         for image_id in contradicted:
             self.mapper.observation_manager.deregister_frame(self.model.image(image_id).frame_id)
         self.registered = tuple(sorted({*self.registered, *(i - 1 for i in found if i not in contradicted)}))
@@ -261,17 +261,6 @@ class MapperSession:
     def _register_each(self, image_ids: Sequence[int]) -> list[int]:
         options = self._registration_options()
         return [i for i in image_ids if self.mapper.register_next_image(options, i)]
-
-    def _contradicted(self, image_ids: Sequence[int]) -> set[int]:
-        """Those of the images whose verified matches do not satisfy the epipolar constraint; see ``agrees``."""
-        total, agreeing = dict.fromkeys(image_ids, 0), dict.fromkeys(image_ids, 0.0)
-        fractions = inlier_fractions(self.features, self.views(), tolerance=COARSE_TOLERANCE_FRACTION, min_matches=1)
-        for pair, fraction in fractions.items():
-            for image_id in {pair[0] + 1, pair[1] + 1} & total.keys():
-                matches = len(self.features.verified[pair])
-                total[image_id] += matches
-                agreeing[image_id] += fraction * matches
-        return {i for i in image_ids if agreeing[i] < MIN_AGREEING_FRACTION * max(total[i], 1)}
 
     def _registration_options(self) -> pycolmap.IncrementalMapperOptions:
         """Fewer points than COLMAP's minimum suffice, because most matches of the image must agree afterwards."""
@@ -359,14 +348,28 @@ def agrees(
     features: MatchedFeatures, model: pycolmap.Reconstruction, image_id: int, collection: ImageCollection
 ) -> bool:
     """Most verified matches of the image with other registered images satisfy the epipolar constraint."""
-    poses = poses_of(model)
+    return not contradicted_images(features, model, [image_id], collection)
+
+
+def contradicted_images(
+    features: MatchedFeatures, model: pycolmap.Reconstruction, image_ids: Sequence[int], collection: ImageCollection
+) -> set[int]:
+    """Those of the images, by id, of whose verified matches too few satisfy the epipolar constraint; see ``agrees``."""
+    poses, asked = poses_of(model), {image_id - 1 for image_id in image_ids}
     around = {
-        pair: rows for pair, rows in features.verified.items() if image_id - 1 in pair and all(i in poses for i in pair)
+        pair: rows
+        for pair, rows in features.verified.items()
+        if not asked.isdisjoint(pair) and all(i in poses for i in pair)
     }
     near = {i: poses[i] for pair in around for i in pair}
     views = views_of(near, cameras_of(model, collection.cameras), collection)
     found = verify_guided(replace(features, raw=around, verified=around), views, tolerance=COARSE_TOLERANCE_FRACTION)
-    return found.correspondences.num_matches >= MIN_AGREEING_FRACTION * max(sum(map(len, around.values())), 1)
+    total, agreeing = dict.fromkeys(asked, 0), dict.fromkeys(asked, 0)
+    for pair, rows in around.items():
+        for image in asked.intersection(pair):
+            total[image] += len(rows)
+            agreeing[image] += len(found.correspondences.matches.get(pair, ()))
+    return {image + 1 for image in asked if agreeing[image] < MIN_AGREEING_FRACTION * max(total[image], 1)}
 
 
 def views_of(

@@ -24,10 +24,10 @@ from smust3r_colmap.execution.progress import Stage
 from smust3r_colmap.execution.run_context import Run
 from smust3r_colmap.execution.task_pool import TaskFailure, in_child
 from smust3r_colmap.features.covisibility import SeenSurface, select_pairs
-from smust3r_colmap.features.guided_verification import read_matched_features
+from smust3r_colmap.features.guided_verification import count_verified, read_matched_features
 from smust3r_colmap.features.pose_readings import AS_COLMAP, agreement, best_reading
 from smust3r_colmap.features.seen_surfaces import seen_surfaces, surfaces_of_clouds, surfaces_of_maps
-from smust3r_colmap.features.stage import features_of_run, match_pairs_of_run, verified_pairs
+from smust3r_colmap.features.stage import features_of_run, match_pairs_of_run
 from smust3r_colmap.geometry.arrays import FloatArray, Pair
 from smust3r_colmap.products import EMPTY_CLOUD, DepthMaps, ImageCollection, RunFeatures, Scene
 from smust3r_colmap.refinement.global_refinement import RESULTS, UNCERTAINTIES, RefineTask, refine_scenes
@@ -49,7 +49,7 @@ from smust3r_colmap.storage.run_directory import (
 
 NEXT_IMAGES = 4
 """Neighbours in order that are always matched if the backbone has matched nothing."""
-METHOD_VERSION = 9
+METHOD_VERSION = 10
 """To be raised when the refinement changes, so that finished folders are refined again."""
 WORKERS_PER_THREAD = 2
 """Adjustment gains little from threads: on two cores a second one took 70 % more processor time and saved no time."""
@@ -110,8 +110,7 @@ class InitialScenes:
         maps: depth of the scenes; None if the model has none.
         maps_key: hash of all that the maps were made from.
         view_graph: the order of the images.
-        others: images that are no keyframes.
-        pairs_of_others: these with the keyframes beside them, to which they are registered.
+        pairs_of_others: images that are no keyframes with those beside them, to which they are registered.
         surfaces: (S, 3) world points that each image sees, by image index; by default from the maps, or from the
             points of the scenes.
         tolerance: of the poses, as a fraction of the longer image side.
@@ -120,7 +119,6 @@ class InitialScenes:
     scenes: tuple[Scene, ...]
     subsets: tuple[tuple[int, ...], ...]
     view_graph: ViewGraph
-    others: tuple[int, ...] = ()
     pairs_of_others: tuple[Pair, ...] = ()
     maps: DepthMaps | None = None
     maps_key: str = ""
@@ -135,7 +133,6 @@ class InitialScenes:
             scenes=stitched.scenes,
             subsets=windows,
             view_graph=segments.view_graph,
-            others=segments.others,
             pairs_of_others=segments.pairs_of_others,
             maps=stitched.maps,
             maps_key=maps_key,
@@ -203,9 +200,9 @@ def refine(
         features = None
     else:
         features = features or features_of_run(run, collection, feature_options)
-        pairs = _match(run, initial, seen, features, options.track_neighbours)
+        pairs = _match(run, initial, collection.others, seen, features, options.track_neighbours)
     map_pairs = () if source == "features" else _pairs_for_maps(initial, seen, options.track_neighbours)
-    settings = (options, collection.calibrated, initial.tolerance, is_network, initial.others)
+    settings = (options, collection.calibrated, initial.tolerance, is_network, collection.others)
     inputs = (METHOD_VERSION, features and features.key, pairs, initial.geometry, settings, initial.maps_key)
     stored = run.folder.stage(REFINED_STAGE, key=key_of(REFINED_STAGE, inputs))
     with run.clock.stage("refinement", total=1) as stage:
@@ -216,7 +213,6 @@ def refine(
                 stored=stored,
                 collection=collection,
                 scenes=tuple(replace(scene, points=EMPTY_CLOUD) for scene in initial.scenes),
-                others=initial.others,
                 features=None if features is None else features.database,
                 maps=initial.maps if map_pairs else None,
                 map_pairs=map_pairs,
@@ -295,6 +291,7 @@ def refine_external(
 def _match(
     run: Run,
     initial: InitialScenes,
+    others: Sequence[int],
     seen: Sequence[Sequence[SeenSurface]],
     features: RunFeatures,
     per_image: int,
@@ -305,8 +302,8 @@ def _match(
     known = {(a - 1, b - 1) for a, b in map(pycolmap.pair_id_to_image_pair, pair_ids)}
     wanted = {*_wanted_pairs(run, initial, seen, features, known, per_image), *initial.pairs_of_others}
     matched = match_pairs_of_run(run, features, sorted(wanted), title="track matching")
-    verified = verified_pairs(run, features, initial.pairs_of_others, title="track matching") if initial.others else {}
-    blurred = set(initial.others) - {image for pair in verified for image in pair}
+    verified = count_verified(features.database).keys() & set(initial.pairs_of_others)
+    blurred = set(others) - {image for pair in verified for image in pair}
     if blurred:
         near = pairs_with_neighbours(len(features.usable), blurred)
         matched |= match_pairs_of_run(run, features, near, title="track matching of blurred images")

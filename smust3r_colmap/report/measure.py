@@ -10,6 +10,7 @@ import pycolmap
 
 from smust3r_colmap.colmap.reconstruction import SparseObservations
 from smust3r_colmap.geometry.arrays import FloatArray, IntArray
+from smust3r_colmap.geometry.triangulation import triangulation_angle_deg
 from smust3r_colmap.refinement.covariance import parameter_covariance
 from smust3r_colmap.refinement.linearised_model import LinearisedModel
 
@@ -114,10 +115,9 @@ def triangulation_angles_deg(
     angles = []
     for k in seen[:: max(1, -(-len(seen) // MAX_ANGLE_POINTS))].tolist():
         views = image_of[order[starts[k] : starts[k] + counts[k]]]
-        rays = centres[views[:: max(1, -(-len(views) // MAX_ANGLE_VIEWS))]] - xyz[ids[k]]
-        rays /= np.maximum(np.linalg.norm(rays, axis=1), 1e-300)[:, None]
-        angles.append((rays @ rays.T).min())
-    return np.rad2deg(np.arccos(np.clip(np.array(angles, dtype=np.float64), -1, 1)))
+        of_point = centres[views[:: max(1, -(-len(views) // MAX_ANGLE_VIEWS))]]
+        angles.append(triangulation_angle_deg(xyz[ids[k]], of_point))
+    return np.array(angles, dtype=np.float64)
 
 
 # --------------------------------------------------------------------------- cameras

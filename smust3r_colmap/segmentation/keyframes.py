@@ -23,8 +23,8 @@ MAX_SHARE = 0.5
 """Of the images that keyframes may be; with more, leaving the others out saves little and all are used."""
 _TESTED_PAIRS = 20
 """Pairs of neighbours, evenly spread, that tell whether a collection can be dense at all."""
-
 _NEAR_IMAGES = 2
+"""Before and after a blurred image, that it is matched with."""
 
 
 def choose_keyframes(

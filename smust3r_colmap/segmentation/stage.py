@@ -137,7 +137,7 @@ def plan(
         CollectionError: no three images match each other.
     """
     keyframes = [k for k, image in enumerate(collection.images) if image.is_keyframe]
-    others = tuple(k for k, image in enumerate(collection.images) if not image.is_keyframe)
+    others = collection.others
     describe = cache(describe)
     options = config.segmentation
     is_long = options.order == "auto" and len(keyframes) > config.features.exhaustive_below

@@ -12,12 +12,13 @@ import numpy as np
 import pycolmap
 import pytest
 from helpers.summaries import GOOD
+from helpers.surveys import write_blank_survey
 
 from smust3r_colmap.cli.main import main
 from smust3r_colmap.config import RunConfig
 from smust3r_colmap.execution.progress import Reporter
 from smust3r_colmap.report.summary import RunSummary
-from smust3r_colmap.synthetic.survey import HEIGHT, WIDTH, SurveyScene, ground_height, survey_camera
+from smust3r_colmap.synthetic.survey import SurveyScene, ground_height, survey_camera
 
 pytest.importorskip("pyproj")
 
@@ -48,13 +49,7 @@ def _truth_bent_by(bend_m: float) -> Callable[..., RunSummary]:
 
 @pytest.fixture(scope="module")
 def surveyed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from smust3r_colmap.synthetic.survey import write_survey  # noqa: PLC0415
-
-    folder = tmp_path_factory.mktemp("demo")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SurveyScene, "render", lambda *_: np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-        write_survey(folder)
-    return folder
+    return write_blank_survey(tmp_path_factory.mktemp("demo"))
 
 
 @pytest.mark.slow

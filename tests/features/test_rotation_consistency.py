@@ -15,7 +15,7 @@ from smust3r_colmap.geometry.arrays import Pair
 from smust3r_colmap.geometry.camera import Intrinsics
 from smust3r_colmap.products import ImageCollection, SourceImage
 
-CAMERA = Intrinsics(model="SIMPLE_PINHOLE", width=640, height=480, params=(500.0, 320.0, 240.0))
+CAMERA = Intrinsics(model="SIMPLE_PINHOLE", width=640, height=480, params=(500.0, 320.0, 240.0), has_prior_focal=True)
 NUM_IMAGES, REACH = 24, 3
 NUM_POINTS = 60
 FALSE = ((0, 12), (1, 13), (5, 17), (6, 18))

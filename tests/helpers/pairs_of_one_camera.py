@@ -37,15 +37,17 @@ def straight_ahead(k: int) -> np.ndarray:
     return np.column_stack([np.eye(3), [0, 0, -0.3 * k + 6]])
 
 
-def verified_pairs(folder: Path, poses: list[np.ndarray], points: np.ndarray) -> VerifiedPairs:
-    """Pairs up to three steps apart, verified without knowing the camera."""
+def verified_pairs(
+    folder: Path, poses: list[np.ndarray], points: np.ndarray, *, camera: Intrinsics = GUESS
+) -> VerifiedPairs:
+    """Pairs up to three steps apart, verified with a camera that is known if it has a prior focal length."""
     rng = np.random.default_rng(0)
     images = tuple(
         SourceImage(name=f"{k}.png", path=folder / f"{k}.png", width=640, height=480, camera=0, digest=str(k))
         for k in range(len(poses))
     )
     database = folder / "features.db"
-    create_database(database, ImageCollection(images=images, cameras=(GUESS,)))
+    create_database(database, ImageCollection(images=images, cameras=(camera,)))
     xy = [
         TRUTH.xy_img(points @ pose[:, :3].T + pose[:, 3]) + rng.normal(0, NOISE_PX, (len(points), 2)) for pose in poses
     ]
@@ -53,27 +55,28 @@ def verified_pairs(folder: Path, poses: list[np.ndarray], points: np.ndarray) ->
     same = np.column_stack([np.arange(len(points))] * 2).astype(np.uint32)
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = 0
-    camera = GUESS.colmap_camera()
+    own_camera = camera.colmap_camera()
     with open_database(database) as opened:
         for k, own in enumerate(xy):
             opened.write_keypoints(k + 1, own.astype(np.float32))
         for a, b in pairs:
-            geometry = pycolmap.estimate_two_view_geometry(camera, xy[a], camera, xy[b], same, options)
+            geometry = pycolmap.estimate_two_view_geometry(own_camera, xy[a], own_camera, xy[b], same, options)
+            opened.write_matches(a + 1, b + 1, same)
             opened.write_two_view_geometry(a + 1, b + 1, geometry)
     return VerifiedPairs(
         database=database,
         pairs=tuple(sorted(pairs)),
-        cameras=(GUESS,),
+        cameras=(camera,),
         camera_of=dict.fromkeys(range(len(poses)), 0),
         seed=0,
     )
 
 
-def pairs_on_an_arc(folder: Path) -> VerifiedPairs:
+def pairs_on_an_arc(folder: Path, *, camera: Intrinsics = GUESS) -> VerifiedPairs:
     """The cameras look at different places; if all looked at one, nothing could be told."""
     points = np.random.default_rng(1).uniform(-1, 1, (NUM_POINTS, 3))
     turned = Rotation.from_rotvec(np.random.default_rng(2).normal(0, 0.15, (NUM_IMAGES, 3))).as_matrix()
-    return verified_pairs(folder, [turned[k] @ round_the_points(k) for k in range(NUM_IMAGES)], points)
+    return verified_pairs(folder, [turned[k] @ round_the_points(k) for k in range(NUM_IMAGES)], points, camera=camera)
 
 
 def pairs_straight_ahead(folder: Path) -> VerifiedPairs:

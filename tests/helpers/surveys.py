@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+import pytest
 
 from smust3r_colmap.geometry.arrays import FloatArray
 from smust3r_colmap.geometry.camera import Intrinsics
@@ -26,6 +27,16 @@ HEIGHT_M = 45.0
 PIXEL_M = HEIGHT_M / 900
 """5 cm."""
 FRAME_ORIGIN = (600000.0, 5300000.0, 500.0)
+
+
+def write_blank_survey(folder: Path) -> Path:
+    """The survey of ``demo --survey`` with blank images, because rendering all of them takes a minute."""
+    from smust3r_colmap.synthetic.survey import HEIGHT, WIDTH, SurveyScene, write_survey  # noqa: PLC0415
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SurveyScene, "render", lambda *_: np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+        write_survey(folder)
+    return folder
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -56,12 +56,22 @@ def test_a_focal_length_that_the_pairs_agree_with_is_not(on_an_arc: VerifiedPair
         assert contradicted_focal_lengths(model, on_an_arc.database, collection_with(GUESS)) == ()
 
 
-def test_neither_exif_nor_few_images_are_asked_about(on_an_arc: VerifiedPairs) -> None:
+def test_what_another_program_said_does_not_count(tmp_path: Path) -> None:
+    """Its camera is the guess of nothing, and pairs verified with it have no fundamental matrix."""
+    wrong = replace(TRUTH.zoomed(2.2), has_prior_focal=True)
+    pairs = pairs_on_an_arc(tmp_path, camera=wrong)
+    (text,) = contradicted_focal_lengths(model_with(wrong), pairs.database, collection_with(wrong))
+    assert "camera 1 has a focal length of 1056 px, but its image pairs agree on 4" in text
+    right = replace(TRUTH, has_prior_focal=True)
+    assert contradicted_focal_lengths(model_with(right), pairs.database, collection_with(right)) == ()
+
+
+def test_neither_few_images_nor_a_fisheye_are_asked_about(on_an_arc: VerifiedPairs) -> None:
     wrong = TRUTH.zoomed(2.2)
-    known = collection_with(replace(GUESS, has_prior_focal=True))
-    assert contradicted_focal_lengths(model_with(wrong), on_an_arc.database, known) == ()
     few = model_with(wrong, MIN_IMAGES - 1)
     assert contradicted_focal_lengths(few, on_an_arc.database, collection_with(GUESS)) == ()
+    fisheye = Intrinsics(model="SIMPLE_RADIAL_FISHEYE", width=640, height=480, params=wrong.params)
+    assert contradicted_focal_lengths(model_with(fisheye), on_an_arc.database, collection_with(fisheye)) == ()
 
 
 def test_pairs_that_cannot_tell_contradict_nothing(tmp_path: Path) -> None:

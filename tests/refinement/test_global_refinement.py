@@ -153,8 +153,9 @@ def between_keyframes(tmp_path_factory: pytest.TempPathFactory) -> tuple[Refined
         collection = make_collection(folder, NUM_IMAGES)
         verified = {**matches, **(of_others if others else {})}
         write_features(folder / "features.db", collection, world, verified=verified)
-        task = refine_task(folder, collection, (stitched_scene(collection, stitched, keyframes),))
-        results = refine_scenes(replace(task, others=others))
+        images = tuple(replace(image, is_keyframe=k not in others) for k, image in enumerate(collection.images))
+        collection = replace(collection, images=images)
+        results = refine_scenes(refine_task(folder, collection, (stitched_scene(collection, stitched, keyframes),)))
         found.append(
             Refined(world=world, collection=collection, stitched=stitched, folder=folder / "refined", results=results)
         )

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.surveys import write_blank_survey
 
 from smust3r_colmap.errors import StorageError
 from smust3r_colmap.georeferencing.georeference import ModelGeometry, georeference
@@ -30,12 +31,7 @@ POSES = SCENE.cam_from_local()
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """With blank images, because rendering all of them takes a minute."""
-    written = tmp_path_factory.mktemp("survey")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SurveyScene, "render", lambda *_: np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-        write_survey(written)
-    return written
+    return write_blank_survey(tmp_path_factory.mktemp("survey"))
 
 
 @pytest.mark.slow
